@@ -19,7 +19,7 @@ import numpy as np
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 # Of a map of which all is well; then for one without an accepted loop, each power of e by which it
 # is less sure of itself than a right one is exact, odometry that drifts, refused loops that
@@ -65,7 +65,7 @@ def unsureness(growth: Growth) -> float:
 
     That of its positions, aligned, over what a right map is off by at most.
     """
-    manifold = growth.graph.manifold
+    manifold = growth.given.graph.manifold
     posterior = growth.posterior
     own = growth.part[posterior.fixed:] == np.bincount(growth.part).argmax()
     poses = growth.poses[posterior.fixed:][own]
@@ -86,15 +86,15 @@ def left_drift(growth: Growth) -> tuple[float, float]:
     It is what the residuals say that are left in a map: noise was learnt to be as large as drift
     made it, but of noise the turns do not add up. 0 in space, where none is looked for.
     """
-    if growth.graph.manifold is not se2:
+    if growth.given.graph.manifold is not se2:
         return 0.0, 0.0
     rows = np.flatnonzero(growth.accepted)
-    at = np.flatnonzero(~(growth.is_loop | growth.cut)[rows])
+    at = np.flatnonzero(~(growth.given.is_loop | growth.cut)[rows])
     steps = rows[at]
-    factors = growth.factors
+    factors = growth.given.factors
     turn = np.zeros((len(at), 3))
     turn[:, 2] = np.hypot(*factors.measurement[steps, :2].T)
-    noise = growth.variance_at_their_word() if growth.at_their_word else growth.variance
+    noise = growth.noise.assumed
     turn = np.einsum('mij,mj->mi', factors.sqrt_information[steps], turn) / np.sqrt(noise[0])
     found = float((turn * growth.posterior.residual[at]).sum())
     by_noise = np.einsum('mi,miq->q', turn, growth.posterior.left_over(at))

@@ -40,7 +40,7 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     strongest_group,
 )
 from l1slam_ros.core.robust.places import join_what_no_other
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL = 5
@@ -49,9 +49,10 @@ _MOST = 0.55
 
 def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
     """Return the reasons to doubt a map; none: (); ended : nothing more can be accepted."""
-    loops = growth.is_loop[: growth.size]
-    left_out = np.flatnonzero(loops & ~growth.accepted[: growth.size])
-    accepted = np.flatnonzero(loops & growth.accepted[: growth.size])
+    size = growth.given.size
+    loops = growth.given.is_loop[:size]
+    left_out = np.flatnonzero(loops & ~growth.accepted[:size])
+    accepted = np.flatnonzero(loops & growth.accepted[:size])
     reasons = []
     if np.count_nonzero(loops) >= _HANDFUL and len(left_out) > _MOST * np.count_nonzero(loops):
         reasons.append(_doubt(growth, MOSTLY_REFUSED, left_out))
@@ -76,11 +77,12 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
 
     As one loop, by the median of what they say, it would not be believed by odometry alone.
     """
-    if (len(accepted) < _HANDFUL or not growth.may_err_as_one(accepted, 2)
-            or (growth.trusted | growth.factors.is_absolute)[accepted].any()):
+    given = growth.given
+    if (len(accepted) < _HANDFUL or not given.may_err_as_one(accepted, 2)
+            or (given.trusted | given.factors.is_absolute)[accepted].any()):
         return False
     odometry = growth.copy()
-    odometry.accepted = ~growth.is_loop
+    odometry.accepted = ~given.is_loop
     odometry.solve()
     within = accepted[~odometry.across()[accepted]]
     if not len(within):
@@ -94,12 +96,13 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
 
     Parts are what is between two gaps, or slips that were cut.
     """
-    sure = ~growth.is_loop | growth.trusted | growth.factors.is_absolute
-    part = component_labels(growth.graph.subset(growth.accepted & ~growth.cut & sure))
-    rows = np.flatnonzero(growth.accepted & ~sure & (part[growth.low] != part[growth.high]))
+    given = growth.given
+    sure = ~given.is_loop | given.trusted | given.factors.is_absolute
+    part = component_labels(given.graph.subset(growth.accepted & ~growth.cut & sure))
+    rows = np.flatnonzero(growth.accepted & ~sure & (part[given.low] != part[given.high]))
     rows = np.concatenate((rows, agree_at_a_place(growth, growth.joining())))
-    i, j = part[growth.low[rows]], part[growth.high[rows]]
-    _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
+    i, j = part[given.low[rows]], part[given.high[rows]]
+    _, place, count = np.unique(given.place[rows], return_inverse=True, return_counts=True)
     joins = growth.accepted[rows]
     order = np.argsort(-count, kind='stable')
     for number in order[join_what_no_other(place, np.sort((i, j), axis=0), joins)[order]]:
@@ -121,10 +124,11 @@ def _other_map(growth: Growth) -> list[Doubt]:
     the odometry alone is one word against another.
     """
     rows = growth.undecided()
-    accepted = growth.accepted & growth.is_loop
+    accepted = growth.accepted & growth.given.is_loop
+    place = growth.given.place
     agree = agree_at_a_place(growth, rows)
     groups = [strongest_group(growth, rows).rows, *(
-        agree[growth.place[agree] == place] for place in np.unique(growth.place[agree]))]
+        agree[place[agree] == one] for one in np.unique(place[agree]))]
     alone = [group for group in groups if len(group) and not _against(growth, group, accepted)]
     return [_doubt(growth, OTHER_MAP, max(alone, key=len))] if alone else []
 
@@ -137,20 +141,21 @@ def _against(growth: Growth, group: Indices, rows: Mask) -> int:
     its second ends, and what lies between is elsewhere as a whole: two slips are believed of
     several places alone.
     """
-    low, high = growth.low, growth.high
-    across = spanned(low[rows], high[rows], growth.graph.n_poses)
+    low, high = growth.given.low, growth.given.high
+    across = spanned(low[rows], high[rows], growth.given.graph.n_poses)
     against = [across[low[common_steps(growth, group)]].min()]
-    for ends in (low[group], high[group]) if np.ptp(growth.place[group]) else ():
+    for ends in (low[group], high[group]) if np.ptp(growth.given.place[group]) else ():
         inside = ((end >= ends.min()) & (end <= ends.max()) for end in (low[rows], high[rows]))
         against.append(np.count_nonzero(np.logical_or(*inside)))
     return int(min(against))
 
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
-    low = np.maximum(growth.low[rows], 0)
-    high = growth.high[rows]
+    given = growth.given
+    low = np.maximum(given.low[rows], 0)
+    high = given.high[rows]
     return Doubt(kind, len(rows), int(low.min()), int(high.max()),
-                 pairs=listed(growth.factors.pairs[rows]))
+                 pairs=listed(given.factors.pairs[rows]))
 
 
 def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:
@@ -161,6 +166,7 @@ def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:
 
 
 def _slip_doubt(growth: Growth, step: int) -> Doubt:
-    across = growth.factors.pairs[growth.accepted & spanning(growth, step)]
-    return Doubt(SLIP, len(across), int(growth.low[step]), int(growth.high[step]),
+    given = growth.given
+    across = given.factors.pairs[growth.accepted & spanning(growth, step)]
+    return Doubt(SLIP, len(across), int(given.low[step]), int(given.high[step]),
                  pairs=listed(across))
