@@ -33,7 +33,7 @@ from l1slam_ros.core.robust.judgement import (
     Doubt,
     listed,
 )
-from l1slam_ros.core.robust.odometry.slips import SURE, common_steps, spanning
+from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
 from l1slam_ros.core.robust.pairwise_consistency import (
     agree_at_a_place,
     spanned,
@@ -167,6 +167,6 @@ def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:
 
 def _slip_doubt(growth: Growth, step: int) -> Doubt:
     given = growth.given
-    across = given.factors.pairs[growth.accepted & spanning(growth, step)]
+    across = given.factors.pairs[growth.accepted & given.spanning(step)]
     return Doubt(SLIP, len(across), int(given.low[step]), int(given.high[step]),
                  pairs=listed(across))

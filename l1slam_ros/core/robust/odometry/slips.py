@@ -26,7 +26,6 @@ from dataclasses import replace
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
@@ -233,7 +232,7 @@ def common_steps(growth: Growth, rows: Indices) -> Indices:
 
 def _without(growth: Growth, step: int) -> Growth | None:
     """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
-    state, span = growth.copy(), spanning(growth, step)
+    state, span = growth.copy(), growth.given.spanning(step)
     state.cut[step] = True
     state.drops[:] = 0
     state.accepted[span] = state.given.trusted[span]
@@ -249,14 +248,6 @@ def _accept_more(state: Growth) -> None:
     while len(news := state.news()):
         state.accepted[news] = True
         state.solve()
-
-
-def spanning(growth: Growth, step: int) -> Mask:
-    """Return which loops span an odometry factor, (m,) bool."""
-    given = growth.given
-    span: Mask = given.is_loop & (given.low < given.high[step]) & (
-        given.high > given.low[step])
-    return span
 
 
 def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:

@@ -72,6 +72,11 @@ class Evidence:
         """(m,) the later keyframe of each factor."""
         return self.factors.j
 
+    def spanning(self, step: int) -> Mask:
+        """Return which loops span an odometry factor, (m,) bool."""
+        span: Mask = self.is_loop & (self.low < self.high[step]) & (self.high > self.low[step])
+        return span
+
     def gate(self, freedom: Indices, refused: float = REFUSED) -> Array:
         """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
         return student_quantile(1 - refused, freedom, self.graph.manifold.TANGENT_SIZE)
