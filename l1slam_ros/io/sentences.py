@@ -78,8 +78,8 @@ _REASONS = {
             'then, and {loops} loops {where} are left out',
     UNSOLVED: 'solving for the {loops} accepted loops failed ({detail}): this is the map by which '
               'they were judged',
-    PARTS: 'no accepted loop joins {detail} parts of the map, {where}, so their relative poses are '
-           'guesses; {loops} loops between them are left out',
+    PARTS: 'no accepted loop joins {detail} parts of the map, {where}, so their relative poses '
+           'are guesses; {loops} loops between them are left out',
 }
 _REMEDY = 'Vouch for a true loop, strike out a false one, or state the right noise'
 

@@ -79,7 +79,8 @@ from l1slam_ros.core.robust.judgement import (
 from l1slam_ros.core.robust.odometry.drift import straightened, vote
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
-from l1slam_ros.core.robust.rounds import REFUSED, Growth
+from l1slam_ros.core.robust.rounds.evidence import REFUSED
+from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 from l1slam_ros.core.solvers.nonlinear import Solution
@@ -122,7 +123,7 @@ def robust_solve(
         first.begin()
         for number, growth in enumerate(rounds(first, repair), 1):
             so_far = _so_far(growth, repair.drift)
-            report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
+            report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
         judgement = judgement_of(growth, doubts(growth, number < _MOST_ROUNDS))
         return replace(judgement, drift=repair.drift), growth.poses
     except _FAILURES as error:
@@ -168,16 +169,17 @@ class _Repair:
 
 def _won(places_of: Growth, growth: Growth) -> int:
     """Return of how many places the loops are that a state accepts."""
-    return len(np.unique(places_of.place[growth.accepted & growth.is_loop]))
+    return len(np.unique(places_of.given.place[growth.accepted & growth.given.is_loop]))
 
 
 def _so_far(growth: Growth, drift: float = 0.0) -> Believed:
     """Return what a state believes, to fall back on; the loops that it left out are suspect."""
-    size = growth.size
-    slip = growth.cut & ~growth.gap
+    given = growth.given
+    size = given.size
+    slip = growth.cut & ~given.gap
     accepted = (growth.accepted & ~slip)[:size]
-    return Judgement(accepted, growth.is_loop[:size] & ~accepted, np.full(size, np.nan),
-                     growth.variance.copy(), np.ones(size), np.flatnonzero(slip[:size]),
+    return Judgement(accepted, given.is_loop[:size] & ~accepted, np.full(size, np.nan),
+                     growth.noise.variance.copy(), np.ones(size), np.flatnonzero(slip[:size]),
                      drift=drift), growth.poses
 
 
@@ -339,7 +341,7 @@ def judge(
         first.resume(poses, known.accepted, known.variance)
         for growth in rounds(first):
             # The end is not put off once it is in sight, or short budgets would never get there.
-            if time.monotonic() > deadline and not growth.at_their_word:
+            if time.monotonic() > deadline and not growth.noise.at_their_word:
                 settled = False
                 break
         reasons = doubts(growth) if settled else ()

@@ -20,7 +20,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.robust.innovation import spread_of
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
 # Of a map of which all is well; then for one without an accepted loop, each power of e by which it
@@ -66,7 +66,7 @@ def unsureness(growth: Growth) -> float:
     That of its positions, aligned, over what a right map is off by at most. By the noise that was
     found: what a file states may be ten times as much.
     """
-    manifold = growth.graph.manifold
+    manifold = growth.given.graph.manifold
     fixed = growth.posterior.fixed
     own = growth.part[fixed:] == np.bincount(growth.part).argmax()
     poses = growth.poses[fixed:][own]
@@ -82,13 +82,14 @@ def unsureness(growth: Growth) -> float:
 
 def _spread(growth: Growth) -> Array:
     """Return samples of the error that noise as it was found makes, (free keyframes, k, q)."""
-    used = growth.variance_at_their_word() if growth.at_their_word else growth.variance
-    if np.allclose(growth.variance, used):
+    given = growth.given
+    variance, used = growth.noise.variance, growth.noise.assumed
+    if np.allclose(variance, used):
         return growth.posterior.samples[:-1]
     rows = np.flatnonzero(growth.accepted)
     graph = growth.subgraph(rows)
-    noise = (growth.variance / used)[growth.is_loop[rows].astype(np.int64)]
-    noise[growth.factors.is_absolute[rows]] = 1.0
+    noise = (variance / used)[given.is_loop[rows].astype(np.int64)]
+    noise[given.factors.is_absolute[rows]] = 1.0
     return spread_of(graph, growth.poses, cholesky_of(graph), noise)
 
 
@@ -99,15 +100,15 @@ def left_drift(growth: Growth) -> tuple[float, float]:
     It is what the residuals say that are left in a map: noise was learnt to be as large as drift
     made it, but of noise the turns do not add up. 0 in space, where none is looked for.
     """
-    if growth.graph.manifold is not se2:
+    if growth.given.graph.manifold is not se2:
         return 0.0, 0.0
     rows = np.flatnonzero(growth.accepted)
-    at = np.flatnonzero(~(growth.is_loop | growth.cut)[rows])
+    at = np.flatnonzero(~(growth.given.is_loop | growth.cut)[rows])
     steps = rows[at]
-    factors = growth.factors
+    factors = growth.given.factors
     turn = np.zeros((len(at), 3))
     turn[:, 2] = np.hypot(*factors.measurement[steps, :2].T)
-    noise = growth.variance_at_their_word() if growth.at_their_word else growth.variance
+    noise = growth.noise.assumed
     turn = np.einsum('mij,mj->mi', factors.sqrt_information[steps], turn) / np.sqrt(noise[0])
     found = float((turn * growth.posterior.residual[at]).sum())
     by_noise = np.einsum('mi,miq->q', turn, growth.posterior.left_over(at))

@@ -31,7 +31,7 @@ from l1slam_ros.core.robust.forecast import (
 )
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.places import err_together
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 # The map expects a large error of itself, or no loop is accepted; all that are accepted are of one
 # place, which odometry hardly bears out; loops of one place alone say how two parts lie to each
@@ -217,27 +217,28 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
                  settled: bool = True) -> Judgement:
     """Return what a state says of the factors that were given."""
     square, suspect = fits(growth)
-    size = growth.size
-    slip = growth.cut & ~growth.gap
+    given = growth.given
+    size = given.size
+    slip = growth.cut & ~given.gap
     accepted = (growth.accepted & ~slip)[:size]
     sigmas = np.sqrt(square[:size])
-    loops = growth.is_loop[:size]
+    loops = given.is_loop[:size]
     slips = np.flatnonzero(slip[:size])
     unsure = unsureness(growth)
     kinds = {doubt.kind for doubt in reasons}
-    terms = terms_of(bool((growth.is_loop & growth.accepted).any()), unsure,
+    terms = terms_of(bool((given.is_loop & growth.accepted).any()), unsure,
                      *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
     confidence = forecast(terms) if loops.any() else float('nan')
     left_out = np.flatnonzero(loops & ~accepted)
     if settled and np.count_nonzero(loops) >= HANDFUL and forecast(terms[:3]) < CONFIDENT:
-        metres = unsure * right_within(growth.graph.manifold.positions(growth.poses))
-        reasons += (doubt_of(growth.factors.pairs[left_out], growth.graph.n_poses, WEAK,
+        metres = unsure * right_within(growth.given.graph.manifold.positions(growth.poses))
+        reasons += (doubt_of(given.factors.pairs[left_out], growth.given.graph.n_poses, WEAK,
                              f'{metres:.2g}'),)
     doubted = OTHER_MAP in kinds or bool(
         2 * len(left_out) > np.count_nonzero(loops) >= HANDFUL)
-    return Judgement(accepted, suspect[:size], sigmas, growth.variance, _noise(growth)[:size],
-                     slips, reasons, settled, confidence=confidence, terms=terms,
-                     is_refusal_doubted=doubted)
+    return Judgement(accepted, suspect[:size], sigmas, growth.noise.variance,
+                     _noise(growth)[:size], slips, reasons, settled, confidence=confidence,
+                     terms=terms, is_refusal_doubted=doubted)
 
 
 def _noise(growth: Growth) -> Array:
@@ -248,16 +249,17 @@ def _noise(growth: Growth) -> Array:
     of a place err together, these are worth one, and all are as noisy as was found; odometry
     is the unit.
     """
-    noise = np.ones(len(growth.factors))
+    given = growth.given
+    noise = np.ones(len(given.factors))
     rows = np.flatnonzero(growth.accepted)
-    at = np.flatnonzero((growth.is_loop & ~growth.factors.is_absolute)[rows])
+    at = np.flatnonzero((given.is_loop & ~given.factors.is_absolute)[rows])
     loops = rows[at]
-    variance = growth.variance
+    variance = growth.noise.variance
     if len(loops) and variance[1] > 1 and err_together(
-            growth.place[loops], growth.posterior.residual[at], growth.posterior.left_over(at)):
-        noise[growth.is_loop] = variance[1] / variance[0]
-        noise[growth.factors.is_absolute] = 1 / variance[0]
-        noise[loops] *= np.bincount(growth.place[loops])[growth.place[loops]]
+            given.place[loops], growth.posterior.residual[at], growth.posterior.left_over(at)):
+        noise[given.is_loop] = variance[1] / variance[0]
+        noise[given.factors.is_absolute] = 1 / variance[0]
+        noise[loops] *= np.bincount(given.place[loops])[given.place[loops]]
     return noise
 
 
@@ -268,13 +270,14 @@ def fits(growth: Growth) -> tuple[Array, Mask]:
     The square is that of the residual, and of what is not accepted, of the innovation. Suspect,
     (m,) bool, is a loop that fits and yet was not accepted.
     """
+    given = growth.given
     accepted = growth.accepted & ~growth.cut
-    square = np.zeros(len(growth.factors))
+    square = np.zeros(len(given.factors))
     square[growth.accepted] = (growth.posterior.residual**2).sum(axis=1)
     # While nothing ties the map to the world, nothing is known of what names it; nor, while
     # nothing joins two parts, of what leads from one to the other.
     square[~accepted] = np.nan
     outside = np.flatnonzero(~accepted & growth.may_be_predicted & ~growth.across())
     square[outside] = growth.uncut().innovations(outside).square
-    far = square >= growth.gate(growth.factors.freedom)
-    return square, ~accepted & ~far & growth.is_loop
+    far = square >= given.gate(given.factors.freedom)
+    return square, ~accepted & ~far & given.is_loop

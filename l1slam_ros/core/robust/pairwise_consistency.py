@@ -26,7 +26,7 @@ from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.innovation import claimed_volume, log_claims, log_likelihood_ratio
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 # First ends, second ends and measurements of loops.
 Ends = tuple[Indices, Indices, Array]
@@ -64,7 +64,7 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     if len(rows) < 2:
         return NO_GROUP
     one, other, log_ratio = agreement(growth, rows)
-    place, first = np.unique(growth.place[rows], return_index=True, return_inverse=True)[2:0:-1]
+    _, first, place = np.unique(growth.given.place[rows], return_index=True, return_inverse=True)
     evidence = _evidence(place, one, other, log_ratio)
     best = int(np.argmax(evidence))
     needed = np.log(len(rows) / DOUBT)
@@ -72,7 +72,7 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     if evidence[best] < needed or evidence[best] < needed + _by_chance(growth, one_each):
         return NO_GROUP
     found = rows[np.concatenate(([best], other[one == best]))]
-    return Group(found, np.unique(growth.place[found]))
+    return Group(found, np.unique(growth.given.place[found]))
 
 
 def longest_run(growth: Growth, rows: Indices) -> Group:
@@ -91,15 +91,16 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
     """
     rows = asked(growth, rows)
     one, other, _ = agreement(growth, rows)
-    place = growth.place[rows]
-    poses = growth.graph.manifold.positions(growth.poses)
+    given = growth.given
+    place = given.place[rows]
+    poses = given.graph.manifold.positions(growth.poses)
     count = np.bincount(one[place[one] == place[other]], minlength=len(rows))
     found = []
     for number in np.unique(place):
         own = np.flatnonzero(place == number)
         own = own[count[own] >= _MATES]
         ways = [np.ptp(poses[ends[rows[own]]], axis=0).max(initial=0.0)
-                for ends in (growth.low, growth.high)] if len(own) >= RUN else [0.0]
+                for ends in (given.low, given.high)] if len(own) >= RUN else [0.0]
         if min(ways) > _RUN_WAY:
             order = np.argsort(-count[own], kind='stable')
             found.append(Group(rows[own[order]], np.array([number])))
@@ -113,10 +114,10 @@ def agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
     The evidence is that of the best loop of a place: of all that agree with it, as of places in
     `strongest_group`.
     """
-    _, number, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
+    _, number, count = np.unique(growth.given.place[rows], return_inverse=True, return_counts=True)
     rows = asked(growth, rows[count[number] > 1])
     one, other, log_ratio = agreement(growth, rows)
-    number = np.unique(growth.place[rows], return_inverse=True)[1]
+    number = np.unique(growth.given.place[rows], return_inverse=True)[1]
     m = max(len(rows), 1)
     same = number[one] == number[other]
     best = np.zeros(m)
@@ -129,7 +130,8 @@ def agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
 
 def asked(growth: Growth, rows: Indices) -> Indices:
     """Return `ASKED` of some loops, as if at random, or all, (k,)."""
-    chosen: Indices = rows[np.argsort(keys(growth.low[rows], growth.high[rows]))[:ASKED]]
+    order = np.argsort(keys(growth.given.low[rows], growth.given.high[rows]))
+    chosen: Indices = rows[order[:ASKED]]
     return chosen
 
 
@@ -148,10 +150,9 @@ def _by_chance(growth: Growth, rows: Indices) -> float:
     On a sphere, or in any way that is alike everywhere, loops agree by chance far more often than
     if what they claim filled a volume.
     """
-    shuffled = growth.copy()
-    shuffled.high = growth.high.copy()
-    shuffled.high[rows] = np.random.default_rng(0).permutation(growth.high[rows])
-    return float(_evidence(np.arange(len(rows)), *agreement(shuffled, rows)).max(initial=0.0))
+    exchanged = np.random.default_rng(0).permutation(growth.given.high[rows])
+    pairs = agreement(growth, rows, exchanged)
+    return float(_evidence(np.arange(len(rows)), *pairs).max(initial=0.0))
 
 
 def spanned(low: Indices, high: Indices, n: int) -> Indices:
@@ -162,7 +163,8 @@ def spanned(low: Indices, high: Indices, n: int) -> Indices:
     return np.cumsum(change)[:-1]
 
 
-def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
+def agreement(growth: Growth, rows: Indices, high: Indices | None = None
+              ) -> tuple[Indices, Indices, Array]:
     """
     Return the pairs of some loops that rather agree than not, three (pairs,).
 
@@ -171,10 +173,14 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
 
     From the one loop follows the other, if the map is right about how their first ends lie to
     each other, and their second ends; whatever it says of the loops themselves.
+
+    high : (k,) second ends to ask of, None: their own
     """
-    manifold = growth.graph.manifold
+    given = growth.given
+    manifold = given.graph.manifold
     poses = growth.poses
-    first, second, Z = _ends_by_part(growth, rows)
+    high = given.high[rows] if high is None else high
+    first, second, Z = _ends_by_part(growth, rows, high)
     same_way = growth.part[first] * (growth.part.max() + 1) + growth.part[second]
     a, b = np.triu_indices(len(rows), 1)
     alike = same_way[a] == same_way[b]
@@ -199,21 +205,21 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     freedom = factors.freedom[b]
     log_ratio = log_likelihood_ratio(square, log_det, log_claims(factors, volume)[b], freedom,
                                      k)
-    good = np.flatnonzero((square < growth.gate(freedom)) & (log_ratio > np.log(len(rows))))
+    good = np.flatnonzero((square < given.gate(freedom)) & (log_ratio > np.log(len(rows))))
     a = a[good]
     b = b[good]
     log_ratio = log_ratio[good]
     return np.concatenate((a, b)), np.concatenate((b, a)), np.tile(log_ratio, 2)
 
 
-def _ends_by_part(growth: Growth, rows: Indices) -> Ends:
+def _ends_by_part(growth: Growth, rows: Indices, high: Indices) -> Ends:
     """Return loops as from an earlier part to a later one, within a part to the later keyframe."""
-    low = growth.low[rows]
-    high = growth.high[rows]
-    Z = growth.factors.measurement[rows]
+    given = growth.given
+    low = given.low[rows]
+    Z = given.factors.measurement[rows]
     turn = growth.part[low] > growth.part[high]
     return (np.where(turn, high, low), np.where(turn, low, high),
-            np.where(turn[:, None], growth.graph.manifold.inverse(Z), Z))
+            np.where(turn[:, None], given.graph.manifold.inverse(Z), Z))
 
 
 def _follows(
@@ -233,7 +239,7 @@ def _spread(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) ->
     To first order Ad (Za S)^-1 and -Ad (F Za S)^-1 times the steps of the first ends of a and b,
     -Ad S^-1 and the identity times those of the second ends.
     """
-    manifold = growth.graph.manifold
+    manifold = growth.given.graph.manifold
     low, high, _ = ends
     samples, noise = growth.posterior.samples, growth.posterior.noise
     F, onward, S = _follows(manifold, ends, growth.poses, a, b)

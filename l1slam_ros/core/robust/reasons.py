@@ -34,21 +34,22 @@ from l1slam_ros.core.robust.judgement import (
     Doubt,
     listed,
 )
-from l1slam_ros.core.robust.odometry.slips import SURE, common_steps, spanning
+from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
 from l1slam_ros.core.robust.pairwise_consistency import (
     agree_at_a_place,
     spanned,
     strongest_group,
 )
 from l1slam_ros.core.robust.places import join_what_no_other
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 
 def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
     """Return the reasons to doubt a map; none: (); ended : nothing more can be accepted."""
-    loops = growth.is_loop[: growth.size]
-    left_out = np.flatnonzero(loops & ~growth.accepted[: growth.size])
-    accepted = np.flatnonzero(loops & growth.accepted[: growth.size])
+    size = growth.given.size
+    loops = growth.given.is_loop[:size]
+    left_out = np.flatnonzero(loops & ~growth.accepted[:size])
+    accepted = np.flatnonzero(loops & growth.accepted[:size])
     reasons = []
     if not ended and len(left_out):
         reasons.append(_doubt(growth, UNFINISHED, left_out))
@@ -71,11 +72,12 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
 
     As one loop, by the median of what they say, it would not be believed by odometry alone.
     """
-    if (len(accepted) < HANDFUL or not growth.may_err_as_one(accepted, 2)
-            or (growth.trusted | growth.factors.is_absolute)[accepted].any()):
+    given = growth.given
+    if (len(accepted) < HANDFUL or not given.may_err_as_one(accepted, 2)
+            or (given.trusted | given.factors.is_absolute)[accepted].any()):
         return False
     odometry = growth.copy()
-    odometry.accepted = ~growth.is_loop
+    odometry.accepted = ~given.is_loop
     odometry.solve()
     within = accepted[~odometry.across()[accepted]]
     if not len(within):
@@ -89,12 +91,13 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
 
     Parts are what is between two gaps, or slips that were cut.
     """
-    sure = ~growth.is_loop | growth.trusted | growth.factors.is_absolute
-    part = component_labels(growth.graph.subset(growth.accepted & ~growth.cut & sure))
-    rows = np.flatnonzero(growth.accepted & ~sure & (part[growth.low] != part[growth.high]))
+    given = growth.given
+    sure = ~given.is_loop | given.trusted | given.factors.is_absolute
+    part = component_labels(given.graph.subset(growth.accepted & ~growth.cut & sure))
+    rows = np.flatnonzero(growth.accepted & ~sure & (part[given.low] != part[given.high]))
     rows = np.concatenate((rows, agree_at_a_place(growth, growth.joining())))
-    i, j = part[growth.low[rows]], part[growth.high[rows]]
-    _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
+    i, j = part[given.low[rows]], part[given.high[rows]]
+    _, place, count = np.unique(given.place[rows], return_inverse=True, return_counts=True)
     joins = growth.accepted[rows]
     order = np.argsort(-count, kind='stable')
     for number in order[join_what_no_other(place, np.sort((i, j), axis=0), joins)[order]]:
@@ -116,10 +119,11 @@ def _other_map(growth: Growth) -> list[Doubt]:
     the odometry alone is one word against another.
     """
     rows = growth.undecided()
-    accepted = growth.accepted & growth.is_loop
+    accepted = growth.accepted & growth.given.is_loop
+    place = growth.given.place
     agree = agree_at_a_place(growth, rows)
     groups = [strongest_group(growth, rows).rows, *(
-        agree[growth.place[agree] == place] for place in np.unique(growth.place[agree]))]
+        agree[place[agree] == one] for one in np.unique(place[agree]))]
     alone = [group for group in groups if len(group) and _may_be_right(growth, group, accepted)]
     return [_doubt(growth, OTHER_MAP, max(alone, key=len))] if alone else []
 
@@ -133,21 +137,23 @@ def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:
     rather one mistake. Or the group is of several places, all seen from one keyframe that is out
     of line: the odometry slipped to it, and back.
     """
-    low, high = growth.low, growth.high
-    across = spanned(low[accepted], high[accepted], growth.graph.n_poses)
+    given = growth.given
+    low, high = given.low, given.high
+    across = spanned(low[accepted], high[accepted], given.graph.n_poses)
     untold = np.count_nonzero(across[low[common_steps(growth, group)]] == 0)
-    if growth.may_err_as_one(group, 2):
-        return bool(untold >= DOUBT * np.count_nonzero(~growth.is_loop))
+    if given.may_err_as_one(group, 2):
+        return bool(untold >= DOUBT * np.count_nonzero(~given.is_loop))
     told = np.concatenate((low[accepted], high[accepted]))
     return bool(untold) or any(not np.ptp(ends) and ends[0] not in told
                                for ends in (low[group], high[group]))
 
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
-    low = np.maximum(growth.low[rows], 0)
-    high = growth.high[rows]
+    given = growth.given
+    low = np.maximum(given.low[rows], 0)
+    high = given.high[rows]
     return Doubt(kind, len(rows), int(low.min()), int(high.max()),
-                 pairs=listed(growth.factors.pairs[rows]))
+                 pairs=listed(given.factors.pairs[rows]))
 
 
 def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:
@@ -158,6 +164,7 @@ def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:
 
 
 def _slip_doubt(growth: Growth, step: int) -> Doubt:
-    across = growth.factors.pairs[growth.accepted & spanning(growth, step)]
-    return Doubt(SLIP, len(across), int(growth.low[step]), int(growth.high[step]),
+    given = growth.given
+    across = given.factors.pairs[growth.accepted & given.spanning(step)]
+    return Doubt(SLIP, len(across), int(given.low[step]), int(given.high[step]),
                  pairs=listed(across))

@@ -16,10 +16,11 @@ from problems import EVERY, play
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.robust import batch, rounds
+from l1slam_ros.core.robust import batch
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, minimise_robustly, robust_solve
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
 from l1slam_ros.core.robust.judgement import FAILED, UNSOLVED
+from l1slam_ros.core.robust.rounds import growth
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
@@ -38,7 +39,7 @@ def bad():
 def failing(monkeypatch):
     """Return what lets the judgement fail when it samples a map for the n-th time."""
     def fail_at(number, error=GraphError):
-        asked, sample = [], rounds.sample_posterior
+        asked, sample = [], growth.sample_posterior
 
         def sampled(*arguments):
             asked.append(1)
@@ -46,7 +47,7 @@ def failing(monkeypatch):
                 raise error(WHY)
             return sample(*arguments)
 
-        monkeypatch.setattr(rounds, 'sample_posterior', sampled)
+        monkeypatch.setattr(growth, 'sample_posterior', sampled)
 
     return fail_at
 

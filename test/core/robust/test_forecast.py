@@ -17,7 +17,7 @@ from l1slam_ros.core.robust.batch import robust_solve, rounds
 from l1slam_ros.core.robust.forecast import CONFIDENT, forecast, terms_of
 from l1slam_ros.core.robust.judgement import DRIFTS, WEAK, judgement_of
 from l1slam_ros.core.robust.reasons import doubts
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 
 def out_and_back(drift, legs=3, length=60, seed=0):

@@ -17,7 +17,7 @@ from l1slam_ros.core.graph.factor_graph import ends_in_time
 from l1slam_ros.core.robust.odometry.slips import SPANNING, common_steps
 from l1slam_ros.core.robust.pairwise_consistency import spanned, strongest_group
 from l1slam_ros.core.robust.reasons import doubts
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 # The robot turned by 90 degrees more, there.
 STEP, TURN = 200, (0, 0, np.pi / 2)
@@ -42,9 +42,9 @@ def test_loops_across_a_slip_agree(bad):
     growth = grown(slipped(bad.graph, STEP, TURN))
     group = strongest_group(growth, growth.undecided())
     assert len(group.places) >= SPANNING
-    assert not is_false(bad, growth.factors)[group.rows].any()
-    assert ((growth.low[group.rows] <= STEP) & (growth.high[group.rows] > STEP)).all()
-    steps = growth.low[common_steps(growth, group.rows)]
+    assert not is_false(bad, growth.given.factors)[group.rows].any()
+    assert ((growth.given.low[group.rows] <= STEP) & (growth.given.high[group.rows] > STEP)).all()
+    steps = growth.given.low[common_steps(growth, group.rows)]
     assert steps.min() <= STEP <= steps.max()
 
 

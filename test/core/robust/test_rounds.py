@@ -18,7 +18,7 @@ from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust import innovation
 from l1slam_ros.core.robust.batch import robust_solve
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers import gauss_newton
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
@@ -30,12 +30,12 @@ def test_few_true_loops_are_beyond_the_gate(monkeypatch):
         # The same keyframes draw alike: each world is given draws of its own.
         monkeypatch.setattr(innovation, 'keys', lambda *ends, seed=seed: keys(*ends) + seed)
         growth = Growth(careful_world(200, 1200, seed).graph)
-        loops = np.flatnonzero(growth.is_loop)
+        loops = np.flatnonzero(growth.given.is_loop)
         growth.accepted[np.random.default_rng(seed).choice(loops, 5, replace=False)] = True
         growth.solve()
         rows = growth.undecided()
         found = growth.innovations(rows)
-        refused += np.count_nonzero(found.square >= growth.gate(found.freedom))
+        refused += np.count_nonzero(found.square >= growth.given.gate(found.freedom))
         asked += len(rows)
     # One in a thousand would be if noise had the tail that is granted; normal noise has less.
     assert asked > 50_000
@@ -78,7 +78,7 @@ def test_lies_of_one_place_do_not_teach_their_noise():
     measure(graph, truth, start, start + 50, [-8.0, 0.0, 0.0], SURE)
     growth = Growth(graph)
     growth.begin()
-    assert growth.variance[1] <= 1
+    assert growth.noise.variance[1] <= 1
     assert not len(growth.believable(growth.undecided()))
 
 
@@ -100,7 +100,7 @@ def test_of_two_that_contradict_each_other_neither_is_believed(apart, count, bel
     growth.solve()
     rows = growth.undecided()
     found = growth.innovations(rows)
-    assert (found.square < growth.gate(found.freedom)).all()
+    assert (found.square < growth.given.gate(found.freedom)).all()
     assert len(growth.believable(rows)) == believed
 
 
@@ -129,6 +129,6 @@ def test_an_order_is_found_once_for_the_same_factors(monkeypatch):
     growth.solve()
     assert found == [600]
     assert np.abs(growth.poses - poses).max() < 0.05  # the noise was learnt meanwhile
-    growth.accepted[np.flatnonzero(growth.is_loop)[0]] = False
+    growth.accepted[np.flatnonzero(growth.given.is_loop)[0]] = False
     growth.solve()
     assert found == [600, 599]

@@ -19,7 +19,7 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.judgement import OTHER_MAP
 from l1slam_ros.core.robust.odometry.motion import log_odds_of_slips, usual_motion
-from l1slam_ros.core.robust.odometry.slips import SURE, spanning, without_slip
+from l1slam_ros.core.robust.odometry.slips import SURE, without_slip
 
 
 @pytest.fixture(scope='module')
@@ -35,11 +35,11 @@ def repaired(graph):
 
 def test_a_slip_is_cut_and_loops_come_in(bad):
     growth = grown(slipped(bad.graph, STEP, TURN))
-    before, loops = growth.cut.copy(), np.count_nonzero(growth.accepted & growth.is_loop)
+    before, loops = growth.cut.copy(), np.count_nonzero(growth.accepted & growth.given.is_loop)
     found = without_slip(growth, growth)
     (cut,) = np.flatnonzero(found.cut)
-    assert growth.low[cut] == STEP
-    assert np.count_nonzero(found.accepted & found.is_loop) > loops + 10
+    assert growth.given.low[cut] == STEP
+    assert np.count_nonzero(found.accepted & found.given.is_loop) > loops + 10
     np.testing.assert_array_equal(growth.cut, before)  # it was tried in a copy
 
 
@@ -93,8 +93,8 @@ def test_what_is_within_the_noise_as_stated_is_no_slip(bad, stated, turn, named)
 def test_what_fits_the_loops_that_come_in_without_it_did_not_slip(bad):
     """As if a lie had held the map elsewhere, and all loops across a step were left out for it."""
     growth = grown(bad.graph)
-    (step,) = np.flatnonzero(~growth.is_loop & (growth.low == STEP))
-    across = growth.accepted & spanning(growth, step)
+    (step,) = np.flatnonzero(~growth.given.is_loop & (growth.given.low == STEP))
+    across = growth.accepted & growth.given.spanning(step)
     growth.accepted[across] = False
     growth.solve()
     found = without_slip(growth, growth)
@@ -132,7 +132,7 @@ def test_where_the_odometry_jumped_it_slipped(bad):
     """Nothing else tells: no loop is left that spans the step."""
     growth = grown(slipped(bad.graph, STEP, (5.0, 0.0, 0.0)))
     odds = log_odds_of_slips(growth, usual_motion(growth))
-    assert growth.low[np.argmax(odds)] == STEP and odds.max() > 0
+    assert growth.given.low[np.argmax(odds)] == STEP and odds.max() > 0
     assert np.sort(odds)[-2] < -SURE
 
 

@@ -24,7 +24,7 @@ from l1slam_ros.core.robust.innovation import (
     claimed_volume,
     log_likelihood_ratio,
 )
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 # Motions are told apart to this part of what they are.
 _GRAIN, _TINY = 1e-3, 1e-12
@@ -80,15 +80,15 @@ class Motion:
 
 def steps_of(growth: Growth, rows: Indices) -> Array:
     """Return what factors measure, in the order of time, as tangents (k, d)."""
-    manifold = growth.graph.manifold
-    return manifold.local(manifold.identity(len(rows)), growth.factors.measurement[rows])
+    manifold = growth.given.graph.manifold
+    return manifold.local(manifold.identity(len(rows)), growth.given.factors.measurement[rows])
 
 
 def usual_motion(growth: Growth) -> Motion:
     """Return how the robot moves by its odometry."""
-    step = steps_of(growth, np.flatnonzero(~growth.is_loop & ~growth.cut))
+    step = steps_of(growth, np.flatnonzero(~growth.given.is_loop & ~growth.cut))
     least = np.diag(_GRAIN**2 * (step**2).mean(axis=0) + _TINY)
-    translation = growth.graph.manifold.TRANSLATION
+    translation = growth.given.graph.manifold.TRANSLATION
     width = np.full(len(least), np.pi**2 / 3)
     width[translation] = (step[:, translation] ** 2).mean()
     motion = Motion(step, step.mean(axis=0), np.cov(step.T) + least, np.inf, 1.0,
@@ -119,11 +119,12 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
 
     Of one that is cut, all others know nothing of it as it is.
     """
-    odds = np.full(len(growth.factors), -np.inf)
-    manifold = growth.graph.manifold
-    factors = growth.factors
+    given = growth.given
+    odds = np.full(len(given.factors), -np.inf)
+    manifold = given.graph.manifold
+    factors = given.factors
     k = manifold.TANGENT_SIZE
-    rows = np.flatnonzero(~growth.is_loop & ~growth.gap & (factors.freedom == k))
+    rows = np.flatnonzero(~given.is_loop & ~given.gap & (factors.freedom == k))
     at = np.searchsorted(np.flatnonzero(growth.accepted), rows)
     R, r = growth.posterior.moment[at], growth.posterior.residual[at]
     inverse = np.linalg.inv(R + _ALONE * np.eye(k))
@@ -139,12 +140,12 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     square, log_det = kernels.prediction.normalise(inverse.copy(), innovation[:, :, 0])
     # All may be as noisy as they turn out, or as they say.
     found = max((r[~cut] ** 2).sum() / np.trace(R[~cut], axis1=1, axis2=2).sum(), 1.0)
-    said = growth.variance_at_their_word()[0] / growth.variance[0]
+    said = growth.noise.word[0] / growth.noise.variance[0]
     fit = np.max([log_likelihood_ratio(square / noise, log_det + k * np.log(noise),
                                        np.zeros(1), factors.freedom[rows], k)
                   for noise in (found, said)], axis=0) - np.linalg.slogdet(root)[1]
     start = manifold.identity(len(rows))
-    moved = manifold.retract(growth.factors.measurement[rows], (root @ innovation)[:, :, 0])
+    moved = manifold.retract(factors.measurement[rows], (root @ innovation)[:, :, 0])
     J = manifold.local_jacobian(start, moved)
     claims = claimed_volume(manifold, growth.poses).sum()
     motions = motion.log_density(manifold.local(start, moved), J @ spread @ J.transpose(0, 2, 1))

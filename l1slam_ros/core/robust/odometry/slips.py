@@ -21,12 +21,11 @@ that came in without it did not slip: a lie had bent the map.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
@@ -43,7 +42,7 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     spanned,
     strongest_group,
 )
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 # Places that join two parts, and of a group that makes a slip suspected, at least.
 JOINING, SPANNING = 2, 3
@@ -62,10 +61,11 @@ def join(growth: Growth, by_runs: bool = False) -> bool:
 
     by_runs : where loops of two places do not, those of one that is long may
     """
+    given = growth.given
     joined = False
     while (rows := growth.joining()).size:
-        parts = growth.part[np.stack((growth.low[rows], growth.high[rows]))]
-        pair = np.sort(parts, axis=0).T @ np.array([growth.graph.n_poses, 1])
+        parts = growth.part[np.stack((given.low[rows], given.high[rows]))]
+        pair = np.sort(parts, axis=0).T @ np.array([given.graph.n_poses, 1])
         groups = [strongest_group(growth, rows[pair == one]) for one in np.unique(pair)]
         group = max(groups, key=lambda group: len(group.places))
         if len(group.places) < JOINING and by_runs:
@@ -82,9 +82,10 @@ def join(growth: Growth, by_runs: bool = False) -> bool:
 
 def _join_by(growth: Growth, group: Group) -> None:
     """Move the later one of two parts to where the first loop of a group says, accept all."""
-    manifold, loop = growth.graph.manifold, group.rows[0]
-    fixed, moving = growth.low[loop], growth.high[loop]
-    Z = growth.factors.measurement[loop, None]
+    given = growth.given
+    manifold, loop = given.graph.manifold, group.rows[0]
+    fixed, moving = given.low[loop], given.high[loop]
+    Z = given.factors.measurement[loop, None]
     if growth.part[fixed] > growth.part[moving]:
         fixed, moving, Z = moving, fixed, manifold.inverse(Z)
     wanted = manifold.compose(growth.poses[fixed, None], Z)
@@ -136,26 +137,29 @@ def _with_runs(growth: Growth) -> Growth | None:
     that backs up, or slides on one floor, errs by more where nothing else looks. A run that is off
     by no more than that, of whose place nothing is accepted, is rather true than a lie.
     """
-    rows, noisier, loops = growth.undecided(), growth.copy(), growth.accepted & growth.is_loop
-    rows = rows[~np.isin(growth.place[rows], growth.place[loops])]
-    if len(rows) < RUN or growth.ventured.any() or growth.may_err_as_one(np.flatnonzero(loops)):
+    given, noise = growth.given, growth.noise
+    rows, loops = growth.undecided(), growth.accepted & given.is_loop
+    rows = rows[~np.isin(given.place[rows], given.place[loops])]
+    if len(rows) < RUN or growth.ventured.any() or given.may_err_as_one(np.flatnonzero(loops)):
         return None
-    noisier.variance = growth.variance * (_NOISIER, 1.0)
+    noisier = growth.copy()
+    noisier.noise = replace(noise, variance=noise.variance * (_NOISIER, 1.0))
     noisier.solve()
     found = noisier.innovations(rows)
-    groups = runs(growth, rows[found.square < noisier.gate(found.freedom)])
+    groups = runs(growth, rows[found.square < given.gate(found.freedom)])
     if not groups:
         return None
     state = growth.copy()
     for group in groups:
         state.accepted[group.rows] = state.ventured[group.rows] = True
-    state.variance, state.drops[:] = noisier.variance, 0
+    state.noise = replace(noise, variance=noisier.noise.variance)
+    state.drops[:] = 0
     # Once from noise that is far too large, and once from what was left of that.
     for _ in range(2):
-        state.learnt_of = state.learnt_of[:0]
+        state.noise = state.noise.forgotten()
         state.solve()
     _accept_more(state)
-    is_noisier = state.variance[0] > _MOST * min(growth.first_variance[0], 1.0)
+    is_noisier = state.noise.variance[0] > _MOST * min(growth.noise.first[0], 1.0)
     return None if is_noisier or _gain(growth, growth, state) <= 0 else state
 
 
@@ -193,11 +197,12 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
 
     least : how large the odds are against those that are suspected for their own, at most
     """
-    tell = growth.accepted & growth.is_loop
+    given = growth.given
+    tell = growth.accepted & given.is_loop
     tell[left_out] = True
-    across = spanned(growth.low[tell], growth.high[tell], growth.graph.n_poses)
+    across = spanned(given.low[tell], given.high[tell], given.graph.n_poses)
     # Where no loop can tell, an unusual motion is no more than that.
-    told = np.where((across[growth.low] > 0) & ~growth.cut, odds, -np.inf)
+    told = np.where((across[given.low] > 0) & ~growth.cut, odds, -np.inf)
     order = np.argsort(-told, kind='stable')[:_TRIED]
     suspects: list[int] = order[told[order] > -least].tolist()
     for _ in range(_TRIED):
@@ -214,18 +219,19 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
 
 def common_steps(growth: Growth, rows: Indices) -> Indices:
     """Return the odometry that most of some loops span, (k,)."""
-    across = spanned(growth.low[rows], growth.high[rows], growth.graph.n_poses)
+    given = growth.given
+    across = spanned(given.low[rows], given.high[rows], given.graph.n_poses)
     common = np.flatnonzero(across == across.max())
-    steps: Indices = np.flatnonzero(~growth.is_loop & np.isin(growth.low, common))
+    steps: Indices = np.flatnonzero(~given.is_loop & np.isin(given.low, common))
     return steps
 
 
 def _without(growth: Growth, step: int) -> Growth | None:
     """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
-    state, span = growth.copy(), spanning(growth, step)
+    state, span = growth.copy(), growth.given.spanning(step)
     state.cut[step] = True
     state.drops[:] = 0
-    state.accepted[span] = state.trusted[span]
+    state.accepted[span] = state.given.trusted[span]
     state.solve()
     if not join(state) or state.across()[step]:
         return None
@@ -240,16 +246,10 @@ def _accept_more(state: Growth) -> None:
         state.solve()
 
 
-def spanning(growth: Growth, step: int) -> Mask:
-    """Return which loops span an odometry factor, (m,) bool."""
-    span: Mask = growth.is_loop & (growth.low < growth.high[step]) & (
-        growth.high > growth.low[step])
-    return span
-
-
 def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:
     """Return what the places say that are won and lost by a cut, ln of odds."""
-    before, explained, after = (np.unique(growth.place[state.accepted & growth.is_loop])
+    place, is_loop = growth.given.place, growth.given.is_loop
+    before, explained, after = (np.unique(place[state.accepted & is_loop])
                                 for state in (growth, as_stated, cut))
     won = len(np.setdiff1d(after, np.union1d(before, explained)))
     return _place(growth) * (won - len(np.setdiff1d(before, after)))
@@ -257,15 +257,16 @@ def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:
 
 def _place(growth: Growth) -> float:
     """Return what a place is worth, ln of odds: half a gate."""
-    return float(growth.gate(np.array([growth.graph.manifold.TANGENT_SIZE]))[0] / 2)
+    return float(growth.given.gate(np.array([growth.given.graph.manifold.TANGENT_SIZE]))[0] / 2)
 
 
 def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
     """Return the step that slipped, by how the robot moves, of those that no loop tells apart."""
-    loops = state.is_loop & state.accepted
-    ends = np.unique((state.low[loops], state.high[loops]))
-    stretch = np.searchsorted(ends, state.low, side='right')
-    odometry = ~state.is_loop & (~state.cut | (np.arange(len(state.cut)) == cut))
+    given = state.given
+    loops = given.is_loop & state.accepted
+    ends = np.unique((given.low[loops], given.high[loops]))
+    stretch = np.searchsorted(ends, given.low, side='right')
+    odometry = ~given.is_loop & (~state.cut | (np.arange(len(state.cut)) == cut))
     steps = np.flatnonzero(odometry & (stretch == stretch[cut]))
     gain = motion.log_density(*_repaired(state, cut, steps)) - motion.log_density(
         steps_of(state, steps))
@@ -286,12 +287,12 @@ def _cut_rather(state: Growth, cut: int, motion: Motion) -> tuple[Growth, int, b
 
 def _cut_at(state: Growth, cut: int, step: int) -> Growth:
     """Return the state that is cut at a step and not where it is."""
-    state = state.copy()
+    state, given = state.copy(), state.given
     state.cut[[cut, step]] = False, True
     # What lies between goes over to the other side.
-    side = state.low[cut] if state.low[step] > state.low[cut] else state.high[cut]
-    between = np.arange(*np.sort(state.high[[cut, step]]))
-    chain, manifold = odometry_poses(state.graph), state.graph.manifold
+    side = given.low[cut] if given.low[step] > given.low[cut] else given.high[cut]
+    between = np.arange(*np.sort(given.high[[cut, step]]))
+    chain, manifold = given.chain, given.graph.manifold
     here, start = (np.tile(poses[side], (len(between), 1)) for poses in (state.poses, chain))
     state.poses = state.poses.copy()
     state.poses[between] = manifold.compose(here, manifold.between(start, chain[between]))
@@ -304,7 +305,7 @@ def _put_back(state: Growth, steps: list[int], motion: Motion) -> tuple[Growth, 
     """Return the state where steps say what they measured, and their odds, where that fits."""
     odds = float(log_odds_of_slips(state, motion)[steps].max())
     found = state.uncut().innovations(np.array(steps))
-    if odds > 0 or (found.square > state.gate(found.freedom)).any():
+    if odds > 0 or (found.square > state.given.gate(found.freedom)).any():
         return None
     back = state.copy()
     back.cut[steps] = False
@@ -321,9 +322,9 @@ def _moves_as_usual(state: Growth, cut: int, motion: Motion) -> bool:
     """
     row = np.array([cut])
     repaired, spread = _repaired(state, cut, row)
-    gate = state.gate(np.array([len(motion.mean)]))[0]
+    gate = state.given.gate(np.array([len(motion.mean)]))[0]
     # All may be as noisy as they turn out, or as they say.
-    said = state.variance_at_their_word()[0] / state.variance[0]
+    said = state.noise.word[0] / state.noise.variance[0]
     density = max(motion.log_density(repaired, noise * spread)[0] for noise in (1.0, said))
     return bool(motion.distance(repaired[0], spread[0]).min() < gate
                 or density > motion.log_density(steps_of(state, row))[0])
@@ -335,14 +336,15 @@ def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
 
     Tangents (m, k) and their covariances (m, k, k): all that follows is moved alike.
     """
-    manifold, chain = state.graph.manifold, odometry_poses(state.graph)
+    given = state.given
+    manifold, chain = given.graph.manifold, given.chain
     row, count = np.array([cut]), len(steps)
     measured = state.uncut()
     root, spread = unwhitening(measured, row), measured.innovations(row).spread
-    low, high = state.low[row], state.high[row]
+    low, high = given.low[row], given.high[row]
     moved = manifold.between(state.poses[low], state.poses[high])
-    before = manifold.between(chain[state.low[steps]], np.repeat(chain[low], count, axis=0))
-    after = manifold.between(np.repeat(chain[high], count, axis=0), chain[state.high[steps]])
+    before = manifold.between(chain[given.low[steps]], np.repeat(chain[low], count, axis=0))
+    after = manifold.between(np.repeat(chain[high], count, axis=0), chain[given.high[steps]])
     moved = manifold.compose(manifold.compose(before, np.repeat(moved, count, axis=0)), after)
     start = manifold.identity(count)
     carried = manifold.local_jacobian(start, moved) @ manifold.adjoint(

@@ -9,20 +9,19 @@
 """
 The rounds of a robust solve: predict, gate, accept, solve.
 
-In: a graph and what is accepted of it. Out: the same with more loops accepted. See `batch`.
+In: the evidence and what is accepted of it. Out: the same with more loops accepted. See `batch`.
 """
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, turned
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.first_fixes import first_fixes
-from l1slam_ros.core.graph.parts import as_sure, bridged, vague_odometry
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.gating import believable, noise_variance, stand_apart
 from l1slam_ros.core.robust.innovation import (
@@ -33,17 +32,15 @@ from l1slam_ros.core.robust.innovation import (
     claimed_volume,
     innovations,
     sample_posterior,
-    stated_variance,
-    student_quantile,
-    within_ratio,
 )
 from l1slam_ros.core.robust.inspection import repeated_factors
-from l1slam_ros.core.robust.places import beside_refused, mates, places
+from l1slam_ros.core.robust.places import beside_refused
+from l1slam_ros.core.robust.rounds.evidence import evidence_of
+from l1slam_ros.core.robust.rounds.noise import Noise
 from l1slam_ros.core.solvers.block_cholesky import with_pattern
 from l1slam_ros.core.solvers.gauss_newton import ChangingOrder, l2_optimum
 
-# At most one in so many true loops is refused for its noise alone; and of accepted ones, dropped.
-REFUSED = 1e-3
+# At most one in so many accepted true loops is dropped for its noise alone.
 _DROPPED = 2e-5
 # Probability that any true factor of a round is doubted for what the others say.
 _DOUBTED = 0.01
@@ -51,71 +48,41 @@ _DOUBTED = 0.01
 _CHANCES = 2
 # What is measured of the noise counts against as many factors on which it was measured before.
 _KNOWN = 20
-# The noise is learnt to be no less than this part of the variance that was found first: factors
-# that fit exactly, as of a simulator, say of ever less that it is still too much.
-_LEAST_VARIANCE = 1e-3
 # Noise that is so many times the variance that was found is measured anew before any loop is
 # dropped for it, by the median of chi2 over its freedom; by factors that others check at all.
 _NOISIER, _MEDIAN, _CHECKED = 3.0, 0.79, 0.01
 # While driving so many of the last absolute factors are looked at, with their neighbours.
 _LATEST = 50
-# What is stated counts in the end up to so many times the variance that was found.
-_WORD = 100.0
 # The variance of an odometry factor that was cut, in units of its own: loops alone decide, and far
 # loops know of a step to some hundred sigmas.
 _CUT = 1e8
-# The noise is learnt of loops of so many places at least: of fewer, errors may be one. A place
-# that joins more than this part of the keyframes is no one mistake.
-_FEWEST_PLACES, _SMALL = 3, 0.5
 
 
 class Growth:
     """
-    The state of a robust solve.
+    The state of a robust solve, which each round changes.
 
-    graph : the one given in the order of time, and an odometry factor for each gap, which is cut;
-    size : factors given; accepted, is_loop, trusted : (m,) bool of the between factors; gap, cut :
-    (m,) bool, odometry that says nothing: where there is none, and there or where it slipped; low,
-    high : (m,) the earlier and the later keyframe of each; place : (m,), mates : see `places`, of
-    loops; part : (n,) number of the part of each keyframe; poses : (n, p) the L2 map of the
-    accepted; posterior : of these; variance : (2,) of odometry and loops in units of what they
-    state; slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
-    ventured : (m,) bool, loops of runs that noisier odometry explained; first_variance : (2,) as
-    found before any loop came in; learnt_of : (m,) bool, what it was learnt of last; drops :
-    (m,) how often each was accepted and did not fit; at_their_word : whether factors may be as
-    noisy as they say; in_tail : (m,) bool, not the loops that are too far off for that;
-    check : called before long steps, raises where the work shall stop.
+    given : the evidence; accepted : (m,) bool of its factors; cut : (m,) bool, odometry that says
+    nothing: the gaps, and where it slipped; part : (n,) number of the part of each keyframe;
+    poses : (n, p) the L2 map of the accepted; posterior : of these; noise : as it was found;
+    slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
+    ventured : (m,) bool, loops of runs that noisier odometry explained; drops : (m,) how often
+    each was accepted and did not fit; in_tail : (m,) bool, not the loops that are too far off to
+    be as noisy as they say; check : called before long steps, raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
         self._check = check
-        whole, self.size = bridged(graph), len(graph.between)
-        # Which end is named first is no reason to judge otherwise.
-        in_order = turned(whole, whole.between.i > whole.between.j)
-        self.gap: Mask = vague_odometry(in_order) | (np.arange(len(whole.between)) >= self.size)
-        # A gap says where its sides are, see `subgraph`. As vague as that of a long part may be
-        # stated, digits are lost: the part would turn about it by its rounding.
-        self.graph = as_sure(in_order, self.gap)
-        self.factors, self.trusted = self.graph.between, self.graph.between.trusted
-        self.low, self.high = self.factors.i, self.factors.j
-        self.is_loop: Mask = ~self.factors.is_odometry
-        self.cut: Mask = self.gap.copy()
-        self.accepted: Mask = ~self.is_loop | self.trusted
-        chain = odometry_poses(self.graph)
-        self.place, ends = places(self.graph, chain)
-        loops = np.flatnonzero(self.is_loop)
-        one, other = mates(self.place[loops], ends[loops])
-        self.mates = loops[one], loops[other]
-        self.poses = placed(self.graph.subset(self.accepted), chain)
+        given = self.given = evidence_of(graph)
+        self.cut: Mask = given.gap.copy()
+        self.accepted: Mask = ~given.is_loop | given.trusted
+        self.poses = placed(given.graph.subset(self.accepted), given.chain)
         self.part = np.zeros(graph.n_poses, np.int64)
-        self._stated = stated_variance(self.factors)
-        self.variance = within_ratio(np.ones(2), self._stated)
-        self.learnt_of = np.zeros(0, bool)
-        self.first_variance, self.at_their_word = np.ones(2), False
+        self.noise = Noise.of(given.stated)
         self.posterior: Posterior
         self._order: ChangingOrder | None = None
         self.slip_odds: dict[int, float] = {}
-        none = np.zeros(len(self.factors), bool)
+        none = np.zeros(len(given.factors), bool)
         self.ventured, self.in_tail, self.drops = none, ~none, none.astype(np.int64)
 
     def begin(self) -> None:
@@ -124,42 +91,32 @@ class Growth:
         self.solve()
         rows = self.undecided()
         # A factor that stands there twice fits itself, whatever the noise.
-        rows = np.setdiff1d(rows[~self.factors.is_absolute[rows]], repeated_factors(self.graph))
+        rows = np.setdiff1d(rows[~self.given.factors.is_absolute[rows]],
+                            repeated_factors(self.given.graph))
         # Else the noise that is learnt of them would fit their mistake.
-        if not self.may_err_as_one(rows):
-            found = self.variance * noise_variance(self.innovations(rows))
-            self.variance = within_ratio(found, self._stated)
-            self.first_variance = self.variance
+        if not self.given.may_err_as_one(rows):
+            self.noise = self.noise.begun(
+                self.noise.variance * noise_variance(self.innovations(rows)))
             self.solve()
 
     def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
         """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
-        self.poses, self.variance = poses, within_ratio(variance, self._stated)
-        self.first_variance = np.full(2, LEAST_RATIO)  # it is not known any more, hence no limit
-        self.accepted[: self.size] = accepted | self.trusted[: self.size]
-        self.cut |= ~self.accepted & ~self.is_loop
+        self.poses, self.noise = poses, self.noise.resumed(variance)
+        self.accepted[: self.given.size] = accepted | self.given.trusted[: self.given.size]
+        self.cut |= ~self.accepted & ~self.given.is_loop
         self.accepted |= self.cut
         self._tie_to_world(_LATEST)
         # What the noise of these is, is known.
-        self.learnt_of = self.accepted.copy()
-        if (self.accepted & self.is_loop).any():
+        self.noise = replace(self.noise, learnt_of=self.accepted.copy())
+        if (self.accepted & self.given.is_loop).any():
             self.solve()
         else:
             self.begin()
 
-    def may_err_as_one(self, loops: Indices, fewest: int = _FEWEST_PLACES) -> bool:
-        """Return whether loops are of fewer places, none of which joins much of the way."""
-        place = self.place[loops]
-        numbers = np.unique(place)
-        each = (loops[place == number] for number in numbers)
-        return len(numbers) < fewest and all(
-            np.ptp(self.low[own]) + np.ptp(self.high[own]) < _SMALL * self.graph.n_poses
-            for own in each)
-
     @property
     def may_be_predicted(self) -> Mask:
         """(m,) bool: not absolute factors while none of these is accepted."""
-        absolute = self.factors.is_absolute
+        absolute = self.given.factors.is_absolute
         return ~absolute | (self.accepted & absolute).any()
 
     def _tie_to_world(self, latest: int | None = None) -> None:
@@ -170,29 +127,31 @@ class Growth:
 
         latest : so many of them are looked at; None: all
         """
-        absolute = self.factors.is_absolute
+        absolute = self.given.factors.is_absolute
         held = self.accepted & absolute
         if (held != absolute).any():
             # As many may have been accepted for want of others.
             count = np.count_nonzero(held)
-            known = count > self.graph.manifold.TRANSLATION.stop
-            rows, variance = first_fixes(self.graph, latest, self.variance[0] if known else None)
+            known = count > self.given.graph.manifold.TRANSLATION.stop
+            rows, variance = first_fixes(
+                self.given.graph, latest, self.noise.variance[0] if known else None)
             if known and held[rows].any():
                 self.accepted[rows] = True
             elif len(rows) > count:
-                self.accepted &= ~absolute | self.trusted
+                self.accepted &= ~absolute | self.given.trusted
                 self.accepted[rows] = True
-                own = np.array([max(variance, LEAST_RATIO), self.variance[1]])
-                self.variance = within_ratio(own, self._stated)
+                self.noise = self.noise.found(
+                    np.array([max(variance, LEAST_RATIO), self.noise.variance[1]]))
         # A part that no other factor joins is where most of its own absolute factors say.
         placing = (self.accepted | absolute) & ~self.cut if self.cut.any() else self.accepted
-        self.poses = placed(self.graph.subset(placing), self.poses)
+        self.poses = placed(self.given.graph.subset(placing), self.poses)
 
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
-        for name in ('accepted', 'drops', 'cut', 'in_tail', 'variance', 'slip_odds', 'ventured'):
-            setattr(clone, name, getattr(self, name).copy())
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray | dict):
+                setattr(clone, name, value.copy())
         return clone
 
     def uncut(self) -> 'Growth':
@@ -204,32 +163,27 @@ class Growth:
     def subgraph(self, rows: Indices) -> FactorGraph:
         """Return the graph of some factors, with the noise as it was found."""
         self._check()  # with this, each long step begins
-        noise = self.variance_at_their_word() if self.at_their_word else self.variance
-        variance = np.where(self.factors.is_absolute[rows], 1.0,
-                            noise[self.is_loop[rows].astype(np.int64)])
+        variance = np.where(self.given.factors.is_absolute[rows], 1.0,
+                            self.noise.assumed[self.given.is_loop[rows].astype(np.int64)])
         cut = self.cut[rows]
         # Where loops hold both sides, the odometry between them hardly matters; where nothing
         # does, it is all there is. Either way it says that the keyframes are where they are.
-        low, high = self.factors.i[rows[cut]], self.factors.j[rows[cut]]
+        low, high = self.given.factors.i[rows[cut]], self.given.factors.j[rows[cut]]
         variance[cut] *= np.where(self.part[low] == self.part[high], _CUT, 1.0)
-        subgraph = self.graph.subset(rows, variance)
-        subgraph.between.measurement[cut] = self.graph.manifold.between(
+        subgraph = self.given.graph.subset(rows, variance)
+        subgraph.between.measurement[cut] = self.given.graph.manifold.between(
             self.poses[low], self.poses[high])
         return subgraph
 
-    def variance_at_their_word(self) -> Array:
-        """Return the variance, (2,), where factors are as noisy as they say, or as was found."""
-        word = np.minimum(_WORD * self.variance, 1.0)
-        return within_ratio(np.maximum(self.variance, word), self._stated)
-
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say; loops, where `stand_apart` has it."""
-        more = self.variance_at_their_word()[1] / self.variance[1]
-        rows = self._open(self.may_be_predicted & ~self.across() & ~self.factors.is_absolute)
+        more = self.noise.word[1] / self.noise.variance[1]
+        rows = self._open(self.may_be_predicted & ~self.across() & ~self.given.factors.is_absolute)
         if more > 1:  # else loops say no more than was found
-            self.in_tail[rows] = stand_apart(self.innovations(rows), more, self.gate,
-                                             int((self.accepted & self.is_loop).sum()))
-        self.at_their_word, self.drops[:] = True, 0
+            self.in_tail[rows] = stand_apart(self.innovations(rows), more, self.given.gate,
+                                             int((self.accepted & self.given.is_loop).sum()))
+        self.noise = replace(self.noise, at_their_word=True)
+        self.drops[:] = 0
 
     def undecided(self) -> Indices:
         """Return the loops within a part that may yet be accepted, (k,)."""
@@ -244,20 +198,16 @@ class Growth:
 
     def across(self) -> Mask:
         """Return which factors lead from one part to another, (m,) bool."""
-        across: Mask = self.part[self.low] != self.part[self.high]
-        return across & ~self.factors.is_absolute
-
-    def gate(self, freedom: Indices, refused: float = REFUSED) -> Array:
-        """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
-        return student_quantile(1 - refused, freedom, self.graph.manifold.TANGENT_SIZE)
+        across: Mask = self.part[self.given.low] != self.part[self.given.high]
+        return across & ~self.given.factors.is_absolute
 
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
-        noise_fits = self._knows_noise
+        noise_fits = self.noise.is_known(self.accepted)
         while True:
             vars(self).pop('posterior', None)  # nearly as large as the factor that is made now
             if self.cut.any():
-                self.part = component_labels(self.graph.subset(self.accepted & ~self.cut))
+                self.part = component_labels(self.given.graph.subset(self.accepted & ~self.cut))
             rows = np.flatnonzero(self.accepted)
             subgraph = self.subgraph(rows)
             self._order = ChangingOrder.of(subgraph, rows, self._order)
@@ -279,56 +229,49 @@ class Growth:
                     break
             self.accepted[misfits] = False
             self.drops[misfits] += 1
-        if not self._knows_noise:
-            self._learn_variance(rows)
-            self.learnt_of = self.accepted.copy()
-
-    @property
-    def _knows_noise(self) -> bool:
-        """Whether there is nothing new to learn it of: what was learnt of, says always more."""
-        return self.at_their_word or np.array_equal(self.accepted, self.learnt_of)
+        if not self.noise.is_known(self.accepted):
+            self._learn_noise(rows)
 
     def _is_noisier(self, rows: Indices) -> bool:
         """Raise the variance where half of the factors say that it is far too small."""
-        loops = self.is_loop[rows]
-        if self._knows_noise or self.may_err_as_one(rows[loops]):
+        loops = self.given.is_loop[rows]
+        if self.noise.is_known(self.accepted) or self.given.may_err_as_one(rows[loops]):
             return False
         square = (self.posterior.residual**2).sum(axis=1)
         stated = np.trace(self.posterior.moment, axis1=1, axis2=2)
-        known = (stated > _CHECKED) & ~self.factors.is_absolute[rows]
+        known = (stated > _CHECKED) & ~self.given.factors.is_absolute[rows]
         scale = np.array([np.median(square[known & kind] / stated[known & kind])
                           if (known & kind).any() else 0.0 for kind in (~loops, loops)]) / _MEDIAN
         noisier = scale > _NOISIER
-        self.variance = within_ratio(np.where(noisier, scale, 1.0) * self.variance, self._stated)
+        self.noise = self.noise.found(np.where(noisier, scale, 1.0) * self.noise.variance)
         return bool(noisier.any())
 
     def _misfits(self, rows: Indices, residual: Array, against: Array | float = 0.0) -> Indices:
         """Return the accepted loops that do not fit, or that all others speak against."""
-        freedom = self.factors.freedom[rows]
-        may_go = self.is_loop[rows] & ~self.trusted[rows]
+        freedom = self.given.factors.freedom[rows]
+        may_go = self.given.is_loop[rows] & ~self.given.trusted[rows]
         far = (residual**2).sum(axis=1) > chi2_quantile(1 - _DROPPED, freedom)
         against = np.where(may_go, against, 0.0)
         # Next to a false loop the true ones look bad too: only the worst go.
-        doubted = self.gate(freedom, _DOUBTED / len(rows))
+        doubted = self.given.gate(freedom, _DOUBTED / len(rows))
         far |= against > np.maximum(doubted, against.max(initial=0.0) / 2)
         return np.asarray(rows[far & may_go])
 
-    def _learn_variance(self, rows: Indices) -> None:
+    def _learn_noise(self, rows: Indices) -> None:
         """
         Compare the residuals with what the noise makes of them, for odometry and for loops.
 
         Absolute factors are as noisy as they say: of theirs a few tell nothing.
         """
-        kind, known = self.is_loop[rows], _KNOWN * self.graph.manifold.TANGENT_SIZE
-        own = np.where(self.factors.is_absolute[rows], 0.0, 1.0)
+        kind, known = self.given.is_loop[rows], _KNOWN * self.given.graph.manifold.TANGENT_SIZE
+        own = np.where(self.given.factors.is_absolute[rows], 0.0, 1.0)
         found = np.bincount(kind, own * (self.posterior.residual**2).sum(axis=1), 2)
         stated = np.bincount(kind, own * np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
-        least, scale = _LEAST_VARIANCE * self.first_variance, (found + known) / (stated + known)
-        self.variance = within_ratio(np.maximum(self.variance * scale, least), self._stated)
+        self.noise = self.noise.learnt((found + known) / (stated + known), self.accepted)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""
-        widths = claimed_volume(self.graph.manifold, self.poses)
+        widths = claimed_volume(self.given.graph.manifold, self.poses)
         return innovations(self.subgraph(rows), self.poses, self.posterior, widths)
 
     def news(self) -> Indices:
@@ -344,13 +287,13 @@ class Growth:
         """Return which of some loops may be accepted: each by itself, or else together, (k,)."""
         if not len(rows):
             return rows
-        found, loops = self.innovations(rows), self.accepted & self.is_loop
-        fits = (found.square < self.gate(found.freedom)) & self.in_tail[rows]
-        refused = self.is_loop & ~self.accepted
+        found, loops = self.innovations(rows), self.accepted & self.given.is_loop
+        fits = (found.square < self.given.gate(found.freedom)) & self.in_tail[rows]
+        refused = self.given.is_loop & ~self.accepted
         refused[rows[fits]] = False
         # Taken at their word all are noisier than they are, so that more fit by chance: then only
         # the rest says how many of the rest are false.
-        true = 0 if self.at_their_word else np.count_nonzero(loops)
+        true = 0 if self.noise.at_their_word else np.count_nonzero(loops)
         return np.asarray(rows[believable(
-            found, self.posterior, self.gate, fits, int(true), self.place[rows],
-            beside_refused(self.mates, refused, loops)[rows])])
+            found, self.posterior, self.given.gate, fits, int(true), self.given.place[rows],
+            beside_refused(self.given.mates, refused, loops)[rows])])

@@ -1,0 +1,110 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""
+The evidence of a robust solve: what is given when it begins, and no round changes.
+
+In: a graph. Out: its factors in the order of time, with a factor for each gap of the odometry;
+which of them are loops, and of which place each is.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph, turned
+from l1slam_ros.core.graph.parts import as_sure, bridged, vague_odometry
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.robust.innovation import stated_variance, student_quantile
+from l1slam_ros.core.robust.places import mates, places
+
+# At most one in so many true loops is refused for its noise alone.
+REFUSED = 1e-3
+# The noise is learnt of loops of so many places at least: of fewer, errors may be one. A place
+# that joins more than this part of the keyframes is no one mistake.
+_FEWEST_PLACES, _SMALL = 3, 0.5
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """
+    What is given to a robust solve.
+
+    graph : the one given in the order of time, and an odometry factor for each gap; size : factors
+    given; chain : (n, p) poses along the odometry; is_loop : (m,) bool of the between factors;
+    gap : (m,) bool, odometry that says nothing; place : (m,), mates : see `places`, of loops;
+    stated : (2,) the variance that odometry and loops state.
+    """
+
+    graph: FactorGraph
+    size: int
+    chain: Array
+    is_loop: Mask
+    gap: Mask
+    place: Indices
+    mates: tuple[Indices, Indices]
+    stated: Array
+
+    @property
+    def factors(self) -> BetweenFactors:
+        """All between factors, m."""
+        return self.graph.between
+
+    @property
+    def trusted(self) -> Mask:
+        """(m,) bool: the factors that a person vouches for."""
+        return self.factors.trusted
+
+    @property
+    def low(self) -> Indices:
+        """(m,) the earlier keyframe of each factor."""
+        return self.factors.i
+
+    @property
+    def high(self) -> Indices:
+        """(m,) the later keyframe of each factor."""
+        return self.factors.j
+
+    def spanning(self, step: int) -> Mask:
+        """Return which loops span an odometry factor, (m,) bool."""
+        span: Mask = self.is_loop & (self.low < self.high[step]) & (self.high > self.low[step])
+        return span
+
+    def gate(self, freedom: Indices, refused: float = REFUSED) -> Array:
+        """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
+        return student_quantile(1 - refused, freedom, self.graph.manifold.TANGENT_SIZE)
+
+    def may_err_as_one(self, loops: Indices, fewest: int = _FEWEST_PLACES) -> bool:
+        """Return whether loops are of fewer places, none of which joins much of the way."""
+        place = self.place[loops]
+        numbers = np.unique(place)
+        each = (loops[place == number] for number in numbers)
+        return len(numbers) < fewest and all(
+            np.ptp(self.low[own]) + np.ptp(self.high[own]) < _SMALL * self.graph.n_poses
+            for own in each)
+
+
+def evidence_of(graph: FactorGraph) -> Evidence:
+    """Return the evidence that a graph is."""
+    size = len(graph.between)
+    whole = bridged(graph)
+    # Which end is named first is no reason to judge otherwise.
+    in_order = turned(whole, whole.between.i > whole.between.j)
+    gap: Mask = vague_odometry(in_order) | (np.arange(len(whole.between)) >= size)
+    # A gap says where its sides are, see `Growth.subgraph`. As vague as that of a long part may be
+    # stated, digits are lost: the part would turn about it by its rounding.
+    graph = as_sure(in_order, gap)
+    chain = odometry_poses(graph)
+    is_loop: Mask = ~graph.between.is_odometry
+    place, ends = places(graph, chain)
+    loops = np.flatnonzero(is_loop)
+    one, other = mates(place[loops], ends[loops])
+    return Evidence(graph, size, chain, is_loop, gap, place, (loops[one], loops[other]),
+                    stated_variance(graph.between))
