@@ -13,6 +13,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,10 +22,12 @@ import numpy as np
 from l1slam_ros.cli.commands import Ending, inputs, read, read_scan_map, warn
 from l1slam_ros.cli.reference import Truth, known_false, position_error, read_truth
 from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.memory import free, in_gigabytes, measure_by
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
+from l1slam_ros.core.robust.judgement import PARTS, doubt_of_parts
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
@@ -62,13 +65,13 @@ def solve(arguments: argparse.Namespace) -> Ending:
     asked = asked_of(arguments)
     keep_freed_memory()
     record, made = _read(arguments)
-    return solved(arguments, asked, record, made)
+    return solved(arguments, asked, record, made,
+                  partial(_doubt_parts, record.graph) if made else _as_it_is)
 
 
 def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphRecord,
            made: 'ScanMap | None',
-           settled: Callable[[Outcome], tuple[Outcome, list[str]]] = lambda outcome: (outcome, []),
-           ) -> Ending:
+           settled: Callable[[Outcome], tuple[Outcome, list[str]]]) -> Ending:
     """
     Optimise a graph that was read; print, write and draw what came out.
 
@@ -121,10 +124,33 @@ def _read(arguments: argparse.Namespace) -> tuple[GraphRecord, 'ScanMap | None']
     return made.record, made
 
 
+def _as_it_is(outcome: Outcome) -> tuple[Outcome, list[str]]:
+    return outcome, []
+
+
+def _doubt_parts(graph: FactorGraph, outcome: Outcome) -> tuple[Outcome, list[str]]:
+    """
+    Doubt a map that is in several parts although it is of one drive past scans.
+
+    A graph may be of several sessions, which need not meet. In a drive, the place of a part that
+    no accepted loop joins is where the front end lost its way, and a guess.
+    """
+    judgement = outcome.judgement
+    if judgement is None or outcome.parts == 1:
+        return outcome, []
+    part = component_labels(graph.subset(judgement.accepted))
+    doubts = *judgement.doubts, doubt_of_parts(graph.between, part)
+    return replace(outcome, judgement=replace(judgement, doubts=doubts)), []
+
+
 def _remarks(outcome: Outcome) -> Iterator[str]:
-    """Yield that loops were not judged, where they were not."""
+    """Yield a sentence on each limit of a map: loops not judged, parts not joined."""
     if outcome.unjudged:
         yield f'no loop was doubted: {outcome.unjudged}'
+    said = outcome.judgement.doubts if outcome.judgement else ()
+    if outcome.parts > 1 and all(doubt.kind != PARTS for doubt in said):
+        yield (f'no accepted loop joins {outcome.parts:,} parts of the map, so their relative '
+               'poses are guesses')
 
 
 def _write(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,

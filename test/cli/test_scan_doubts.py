@@ -13,6 +13,7 @@ import json
 import numpy as np
 import pytest
 from rooms import (
+    WALLS,
     along,
     box,
     drive,
@@ -82,6 +83,17 @@ def carried_in_the_dark():
     return standing(true, scans, at - 1, at)
 
 
+def carried_elsewhere():
+    """Return one that goes on in a room which it has not seen."""
+    room = np.array([(40, 0, 46, 0), (46, 0, 46, 9), (46, 9, 40, 7), (40, 7, 40, 0),
+                     (42, 0, 42, 1.2), (44, 8.3, 44, 6.5), (46, 4, 45, 4.8)], float)
+    before = len(ROUND) // 2
+    other = along(np.array([(41, 2.0), (45, 2.0), (45, 5.5), (41.5, 5.5), (41.5, 2.5)]))
+    true = np.concatenate((ROUND[:before], other))
+    return standing(true, drive(true, walls=np.concatenate((WALLS, room)))[0],
+                    before - 1, before)
+
+
 def upside_down():
     """Return a drive with a laser that hangs, which nobody says."""
     scans, wheels = drive(ROUND)
@@ -95,7 +107,7 @@ CASES = {
     'a fifth goes through glass': lambda: (ROUND, *drive(ROUND, spoil=glass)),
     'a mirrored corridor': mirrored_corridor, 'two equal rooms': equal_rooms,
     'carried away': carried, 'carried away in the dark': carried_in_the_dark,
-    'upside down': upside_down}
+    'carried elsewhere': carried_elsewhere, 'upside down': upside_down}
 
 
 def solved(case, folder, capsys):
@@ -118,3 +130,10 @@ def test_no_wrong_map_in_silence(case, tmp_path, capsys):
 def test_what_is_hard_to_see_does_not_spoil_the_map(case, tmp_path, capsys):
     code, said = solved(case, tmp_path, capsys)
     assert code == 0 and said['ate'] < 0.1 and said['loops'] - len(said['rejected']) >= 3
+
+
+def test_a_drive_in_parts_that_nothing_joins_is_doubtful(tmp_path, capsys):
+    code, said = solved('carried elsewhere', tmp_path, capsys)
+    assert code == 4 and said['parts'] == 2
+    assert [doubt['kind'] for doubt in said['doubts']] == ['parts']
+    assert ' joins 2 parts of the map, between ' in said['warnings'][-1]

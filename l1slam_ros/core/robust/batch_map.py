@@ -34,7 +34,7 @@ from l1slam_ros.core.robust.inspection import (
     lacked_step,
     require_connected,
 )
-from l1slam_ros.core.robust.judgement import UNSOLVED, Judgement, doubt_of_parts
+from l1slam_ros.core.robust.judgement import UNSOLVED, Judgement
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
@@ -146,13 +146,9 @@ def solve(
         raise GraphError('the cost leaves double precision: measurements and information of the '
                          'graph are too large, or too different from each other')
     judgement = robust.judgement.of_all(whole) if robust else None
-    part = component_labels(graph)
-    if judgement and part.max() > 0:
-        judgement = replace(judgement, doubts=(
-            *judgement.doubts, doubt_of_parts(whole.between, part)))
     offset = shared_offset(whole, solution.poses, judgement) if judgement else None
     return Outcome(solution, minimiser.solver, minimiser.reason, cost(initial), seed_cost, seconds,
-                   judgement, unjudged, int(part.max()) + 1, offset)
+                   judgement, unjudged, int(component_labels(graph).max()) + 1, offset)
 
 
 def _seed(graph: FactorGraph, method: Method) -> Array:
