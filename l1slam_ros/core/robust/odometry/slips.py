@@ -53,6 +53,8 @@ SURE = float(np.log(1 / DOUBT - 1))
 # By so much more the odometry may vary than its good steps say, for a run to be looked at; and
 # with it, than was found first, and than it states.
 _NOISIER, _MOST = 30.0, 10.0
+# Of fewer steps there is no habit.
+_FEWEST_STEPS = 20
 
 
 def join(growth: Growth, by_runs: bool = False) -> bool:
@@ -107,6 +109,8 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     as_stated : the state where all may be as noisy as they say; what that explains needs no slip
     """
     growth.slip_odds = {step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
+    if np.count_nonzero(~growth.given.is_loop & ~growth.cut) < _FEWEST_STEPS:
+        return None
     motion = usual_motion(growth)
     found, most = None, 0.0
     for steps, odds, state, usual in _tried(growth, as_stated, motion):
