@@ -17,7 +17,7 @@ further from the truth than 1.5 times the map of the true loops alone, and 5 cm;
 known, more than .25 m and .5% of the map's diagonal from that map. The weights are fitted on the
 graphs of `FIT` and on worlds that `drawn` draws. The tables count those of `HELD`, of which
 nothing was used, and sets of fresh worlds, of other seeds and one kind more. Each table names the
-runs whose map was not right and silent.
+runs that were misjudged, and compares `confidence` as it is with what became of the maps.
 """
 
 import argparse
@@ -42,6 +42,7 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
+from l1slam_ros.core.robust.forecast import forecast
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
@@ -197,7 +198,7 @@ def _fitted(rows: list[Row]) -> Array:
     return weights
 
 
-def _tell(name: str, rows: list[Row], weights: Array) -> None:
+def _tell(name: str, rows: list[Row]) -> None:
     """Print how often some runs were said to be right and were, and which were misjudged."""
     wrong, doubted = (np.array([getattr(row, what) for row in rows])
                       for what in ('wrong', 'doubted'))
@@ -212,12 +213,12 @@ def _tell(name: str, rows: list[Row], weights: Array) -> None:
             print('  wrong and silent:' if row.wrong else '  right and doubted:', row.graph,
                   row.asked, ', '.join(sorted(row.doubts)))
     print('\n| confidence | runs | said | right |\n|---|---|---|---|')
-    forecast = 1 / (1 + np.exp(-np.array([row.terms for row in rows]) @ weights))
+    off = 1 - np.array([forecast(row.terms) for row in rows])
     for low, high in zip(_EDGES, _EDGES[1:], strict=False):
-        among = (forecast >= low) & (forecast < high)
+        among = (off >= low) & (off < high)
         if among.any():
             print(f'| {1 - high:.2f} to {1 - low:.2f} | {among.sum()} | '
-                  f'{1 - forecast[among].mean():.3f} | {1 - wrong[among].mean():.3f} |')
+                  f'{1 - off[among].mean():.3f} | {1 - wrong[among].mean():.3f} |')
 
 
 def _share(some: Array) -> str:
@@ -254,10 +255,10 @@ def main() -> int:
         fresh, _, name = row.graph.rpartition(': ')
         halves.setdefault(fresh or ('HELD' if name in HELD else 'FIT'), []).append(row)
     weights = _fitted(halves['FIT'] or rows)
-    print('weights:', ', '.join(f'{weight:.2f}' for weight in weights))
+    print('weights that fit best:', ', '.join(f'{weight:.2f}' for weight in weights))
     for half, among in halves.items():
         if among:
-            _tell(half, among, weights)
+            _tell(half, among)
     return 0
 
 
