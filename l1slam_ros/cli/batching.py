@@ -103,7 +103,7 @@ def _solve(job: Values) -> Values:
     """Return what the table says of a recording, by the command `l1slam solve`."""
     if os.path.exists(job['input']) and not (
             os.path.isfile(job['input']) or os.path.isdir(job['input'])):
-        return failed(2, f'{job["name"]}: is no regular file; expected a recording')
+        return failed(2, f'{job["name"]}: is not a regular file; expected a recording')
     said, complaints = io.StringIO(), io.StringIO()
     with redirect_stdout(said), redirect_stderr(complaints):
         code = main(['solve', job['input'], '--output', job['output'], '--json', '--quiet',
