@@ -145,8 +145,9 @@ class _Growing:
             else:
                 is_loop = topic in (self._topics.loops, REJECTED_LOOP_TOPIC)
                 name = LOOP_TOPIC if is_loop else topic
-                self._builder.add_loop(conversion.LOOPS[name.removeprefix('/')](
-                    message.data, self._builder.base_frame.name, self._map_frame))
+                self._builder.add_loop(conversion.loop_in(
+                    name.removeprefix('/'), message.data, self._builder.base_frame.name,
+                    self._map_frame))
                 if topic == ABSOLUTE_TOPIC:  # the first absolute pose names the map frame
                     self._map_frame = message.data.header.frame_id.removeprefix('/')
         except MessageError as error:

@@ -86,7 +86,7 @@ class Inputs:
 
     def _subscribe(self, robot: RobotPublisher) -> None:
         """Subscribe to the topics of a robot."""
-        for name in conversion.LOOPS:
+        for name in conversion.LOOP_TOPICS:
             self.intake.subscribe(PoseWithCovarianceStamped, f'{robot.prefix}{name}',
                                   self._guarded(partial(self._on_loop, robot, name)))
         # Pose graphs of other front ends, where their messages are installed.
@@ -142,18 +142,12 @@ class Inputs:
         return min((robot.tick() for robot in self._robots), default=math.inf)
 
     def _on_loop(self, robot: RobotPublisher, name: str, message: Any) -> None:
-        base = self._backend.base_frame_of(robot.number).name
-        if not robot.prefix or name not in conversion.LOOPS_BETWEEN:
-            loop = conversion.LOOPS[name](message, base, self._map_frame)
-            self._backend.add_loop(replace(loop, robot=robot.number) if robot.number else loop)
-            return
-        other = self._reference(robot, message.header.frame_id)
-        message.header.frame_id = self._own(other, message.header.frame_id)
-        if other is robot:
-            loop = conversion.LOOPS[name](message, base, self._map_frame)
-        else:
-            loop = conversion.LOOPS_BETWEEN[name](
-                message, self._backend.base_frame_of(other.number).name)
+        other = robot
+        if robot.prefix and name != conversion.ABSOLUTE:
+            other = self._reference(robot, message.header.frame_id)
+            message.header.frame_id = self._own(other, message.header.frame_id)
+        loop = conversion.loop_in(name, message, self._backend.base_frame_of(other.number).name,
+                                  self._map_frame, ordered=other is robot)
         self._backend.add_loop(replace(
             loop, robot=robot.number, reference_robot=other.number))
 
