@@ -113,7 +113,7 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
 
 def _compiled(steps: list[str], stopped: Callable[[], bool]) -> Iterator[tuple[str, list[str]]]:
     """Yield each step and its files in the cache, when a process has compiled it."""
-    count = max(1, min(_cores(), len(steps) // _STEPS_EACH))
+    count = max(1, min(cores(), len(steps) // _STEPS_EACH))
     workers = [_start(steps[first::count]) for first in range(count)]
     busy = {worker.stdout for worker in workers if worker.stdout}
     try:
@@ -202,8 +202,8 @@ def make_ready(step: str) -> None:
             compiled.make_ready(loop, step.endswith(objects.SPACE))
 
 
-def _cores() -> int:
-    """Return how many processors this process may use."""
+def cores() -> int:
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
         os.cpu_count() or 1)
 

@@ -59,9 +59,28 @@ class RobotLine(NamedTuple):
             name.removeprefix(f'{self.name}/') + f'.{key}': value
             for name, traffic in topics.items() if name.startswith(f'{self.name}/')
             for key, value in traffic.last.items()}
-        return DiagnosticStatus(
-            level=level, name=f'{node}: {self.name}', message=sentence, hardware_id=self.name,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+        return status_of(self.name, f'{node}: {self.name}', level, sentence, values)
+
+
+def traffic_values(topics: Mapping[str, Traffic]) -> dict[str, object]:
+    """Return the counts and rates of all topics, as `topic.value`."""
+    return {f'{topic}.{name}': value for topic, traffic in topics.items()
+            for name, value in traffic.values().items()}
+
+
+def status_of(hardware: str, name: str, level: bytes, sentence: str,
+              values: Mapping[str, object]) -> DiagnosticStatus:
+    """Return a status with values as text."""
+    return DiagnosticStatus(
+        level=level, name=name, message=sentence, hardware_id=hardware,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+
+
+def array_of(node: Node, statuses: list[DiagnosticStatus]) -> DiagnosticArray:
+    """Return a message of statuses, stamped with the time of a node."""
+    message = DiagnosticArray(status=statuses)
+    message.header.stamp = node.get_clock().now().to_msg()
+    return message
 
 
 class Diagnostics:
@@ -118,10 +137,7 @@ class Diagnostics:
         """
         lately, broken = refused - self._minute[0][0], told - self._minute[0][1]
         self._minute.append((Counter(refused), Counter(told)))
-        values: dict[str, object] = {
-            f'{topic}.{name}': value for topic, traffic in self._topics.items()
-            for name, value in traffic.values().items()}
-        values |= counts
+        values = traffic_values(self._topics) | dict(counts)
         values['updates'] = self._updates
         if self._last is not None:
             values |= {'l1_cost': f'{self._last.cost:.6g}', 'gap': f'{self._last.gap:.3g}',
@@ -137,21 +153,15 @@ class Diagnostics:
         values |= {f'odometry.{cause}': count for cause, count in sorted(told.items())}
         level, sentence = self._judgement(counts, lately, broken, twins)
         name = self._node.get_fully_qualified_name()
-        status = DiagnosticStatus(
-            level=level, name=f'{name}: map', message=sentence, hardware_id=name,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+        status = status_of(name, f'{name}: map', level, sentence, values)
         lines = [one.status(name, self._topics) for one in robots]
-        message = DiagnosticArray(status=[status, *lines])
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(message)
+        self._publisher.publish(array_of(self._node, [status, *lines]))
 
     def _judgement(self, counts: Mapping[str, int], lately: Counter[str], broken: Counter[str],
                    twins: str) -> tuple[bytes, str]:
         """Return the level and all that is wrong now, in one sentence."""
-        failures = self._failures.lasting
-        if failures:
-            return DiagnosticStatus.ERROR, '; '.join(
-                f'{what} failed: {why}' for what, why in failures.items())
+        if failing := self._failures.sentence:
+            return DiagnosticStatus.ERROR, failing
         wrong = [twins] if twins else []
         for name, traffic in self._topics.items():
             if name.endswith('odom') and (sources := traffic.publishers()) > 1:

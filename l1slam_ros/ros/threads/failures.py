@@ -45,6 +45,11 @@ class Failures:
         now = time.monotonic()
         return {what: why for what, (why, until) in self._lasting.copy().items() if now < until}
 
+    @property
+    def sentence(self) -> str:
+        """What fails, and why, for the diagnostics; empty if nothing does."""
+        return '; '.join(f'{what} failed: {why}' for what, why in self.lasting.items())
+
     def note(self, what: str, error: Exception, seconds: float = math.inf) -> None:
         """
         Remember a failure; its traceback is logged the first time that it comes from there.
