@@ -79,7 +79,6 @@ def _words(arguments: argparse.Namespace) -> list[str]:
             '--odom-topic', arguments.odom_topic, '--loop-topic', arguments.loop_topic]
 
 
-
 def begin() -> None:
     """Answer jobs, as a process that `fleet.isolated` started."""
     serve(_prepare, _solve)
