@@ -7,16 +7,17 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What comes after a factorisation: covariances, and a small dense factor that grows.
+A sparse factorisation bordered by later factors: covariances, and a dense factor that grows.
 
 The arrays of the sparse factor are those of `cholesky`. L^-1 e_p for the k columns of one keyframe
-p is zero but on the way from p to the root of the elimination tree. Of H^-1 e_p what is asked for
-lies on the ways of the other points. These have most in common: what loops join is near.
+p is zero except on the path from p to the root of the elimination tree. Of H^-1 e_p only the rows
+on the paths of the other points are needed. These paths have much in common, because loops join
+keyframes that are near each other.
 
-Points are the keyframes that factors touch. Those that came later have no position in the factor;
-where they are hangs on another point, their parent: x = turn x_parent + noise. Triangles are kept
-row after row, row r from r (r + 1) / 2 on, so that they grow at their end: that of the factor F,
-and the covariances of points, that of s <= t at t (t + 1) / 2 + s.
+Points are the keyframes of later factors. Points newer than the factorisation have no position in
+the factor; they depend on another point, their parent: x = turn x_parent + noise. Triangular
+matrices are stored row by row, row r from r (r + 1) / 2 on, so that they grow at their end: the
+factor F, and the covariances of points, that of s <= t at t (t + 1) / 2 + s.
 """
 
 import numpy as np
