@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What `scan_loops` says of itself on /diagnostics, once a second."""
+"""The diagnostics of `scan_loops`, published once a second."""
 
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -32,11 +32,11 @@ class ScanDiagnostics:
 
     Parameters
     ----------
-    node : whose name and clock it speaks with
-    topics : name -> how its messages come
+    node : to publish with
+    topics : name -> the traffic on it
     front_end : whose state
     drawer : of the map
-    failures : what fails now
+    failures : the failures that last
 
     """
 
@@ -70,7 +70,7 @@ class ScanDiagnostics:
             status_of(name, f'{name}: scans', level, sentence, values)]))
 
     def _judgement(self, lately: Counter[str]) -> tuple[bytes, str]:
-        """Return the level and all that is wrong now, in one sentence."""
+        """Return the level, and a sentence with all that is wrong now."""
         if failing := self._failures.sentence:
             return DiagnosticStatus.ERROR, failing
         wrong = []
