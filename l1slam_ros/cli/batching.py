@@ -24,7 +24,7 @@ from l1slam_ros.core.errors import OptionError
 from l1slam_ros.fleet.batch import FAILED, TABLE, Batch, run
 from l1slam_ros.fleet.isolated import Limits, failed
 from l1slam_ros.fleet.starter import Values, serve
-from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now, load
+from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now, cores, load
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import say
@@ -59,7 +59,7 @@ def batch(arguments: argparse.Namespace) -> Ending:
         arguments.folder, arguments.output, tuple(words), about,
         Limits(arguments.seconds, int(arguments.memory * _GIGABYTE)), arguments.retries,
         arguments.resume is not None, arguments.resume == 'failed')
-    rows = run(asked, begin, arguments.workers or _cores(), arguments.scheduler)
+    rows = run(asked, begin, arguments.workers or cores(), arguments.scheduler)
     found = Counter(row['status'] for row in rows)
     of_code = Counter(row['exit_code'] for row in rows)
     table = arguments.output / f'{TABLE}.csv'
@@ -77,11 +77,6 @@ def _words(arguments: argparse.Namespace) -> list[str]:
     """Return the options of `solve` that say how to read a recording."""
     return ['--rotation-information', arguments.rotation_information,
             '--odom-topic', arguments.odom_topic, '--loop-topic', arguments.loop_topic]
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
-        os.cpu_count() or 1)
 
 
 def begin() -> None:
@@ -103,7 +98,7 @@ def _solve(job: Values) -> Values:
     """Return what the table says of a recording, by the command `l1slam solve`."""
     if os.path.exists(job['input']) and not (
             os.path.isfile(job['input']) or os.path.isdir(job['input'])):
-        return failed(2, f'{job["name"]}: is no regular file; expected a recording')
+        return failed(2, f'{job["name"]}: is not a regular file; expected a recording')
     said, complaints = io.StringIO(), io.StringIO()
     with redirect_stdout(said), redirect_stderr(complaints):
         code = main(['solve', job['input'], '--output', job['output'], '--json', '--quiet',

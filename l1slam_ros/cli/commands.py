@@ -9,7 +9,8 @@
 """The commands of `l1slam` that only read: convert and info, and what all have in common."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -97,12 +98,19 @@ def read_scan_map(arguments: argparse.Namespace, path: Path, quiet: bool = False
     from l1slam_ros.io.scans.reading import read_scans
 
     compile_now((*SCANS, *SPARSE, *JUDGEMENT), quiet)
+    with scan_progress(quiet) as report:
+        return read_scans(path, arguments.odom_topic, topic, report)
+
+
+@contextmanager
+def scan_progress(quiet: bool) -> Iterator[Callable[[int, int, int], None]]:
+    """Yield a function that shows the numbers of scans matched, of all scans, and of loops."""
     with Progress(None, 'scan', quiet, 'matching scans') as progress:
         def report(scans: int, of_all: int, loops: int) -> None:
             progress.reach(scans, of_all)
             progress.advance(0, counted(loops, 'loop'))
 
-        return read_scans(path, arguments.odom_topic, topic, report)
+        yield report
 
 
 def warn(sentences: Sequence[str], quiet: bool = False) -> None:

@@ -12,7 +12,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from l1slam_ros.cli.commands import Ending, inputs, read
+from l1slam_ros.cli.commands import Ending, inputs, read, scan_progress
 from l1slam_ros.cli.solving import asked_of, solved
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.robust.batch_map import Outcome
@@ -21,9 +21,7 @@ from l1slam_ros.fleet.rivals import rival_doubts
 from l1slam_ros.fleet.scanning import Found, scanned
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now
-from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import read_graph_file, read_one_of_several
-from l1slam_ros.io.progress import Progress
 
 _FEWEST = 2
 
@@ -54,11 +52,7 @@ def _parts(arguments: argparse.Namespace, paths: list[Path]) -> tuple[list[Part]
     if arguments.scans is None:
         return [_part(arguments, path) for path in paths], None
     compile_now((*SPARSE, *JUDGEMENT), arguments.quiet)
-    with Progress(None, 'scan', arguments.quiet, 'matching scans') as progress:
-        def report(scans: int, of_all: int, loops: int) -> None:
-            progress.reach(scans, of_all)
-            progress.advance(0, counted(loops, 'loop'))
-
+    with scan_progress(arguments.quiet) as report:
         records, found = scanned(paths, arguments.odom_topic, arguments.scans, report)
     return [Part(path, record) for path, record in zip(paths, records, strict=True)], found
 

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Text and YAML of strangers, looked at before all of it is read: in memory, and in time."""
+"""Limits on text and YAML from others: their size is checked before all of them is read."""
 
 import re
 from pathlib import Path

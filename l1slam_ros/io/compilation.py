@@ -7,14 +7,14 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Filling the cache of compiled loops before they are needed, by processes of their own.
+Compile the loops of `kernels` before they are needed, in processes of their own.
 
 A loop is compiled at its first use after an installation, and later read from the cache. The
-modules of `kernels` know not of each other, so each can be made ready in a process of its own.
+modules of `kernels` do not import each other, so each can be compiled in its own process.
 
-In: nothing. Out: numba's cache, and beside it a note of what it holds, by which the next call
-knows without numba that nothing is to be done. The note counts only for the very sources, Python,
-numba and processor that it was made with, and while the files it names are there.
+Out: the cache of compiled loops, and beside it a note of what the cache holds, from which the next
+call knows, without importing numba, that nothing is to be done. The note is valid for the sources,
+Python, numba and processor with which it was made, as long as the files it names exist.
 """
 
 import ctypes
@@ -37,44 +37,43 @@ from l1slam_ros.core.kernels import compiled
 from l1slam_ros.core.kernels.kept import objects
 from l1slam_ros.io.progress import Progress
 
-# What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by,
-# what keeps up with a graph that grows: modules of `kernels`, those first that take long to
-# compile.
+# Modules of `kernels` for a sparse graph, for judging loops, for a dense graph, and for a graph
+# that grows. Those that take long to compile come first.
 SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
 JUDGEMENT = ('prediction',)
 DENSE = ('halpern',)
 ONLINE = ('border',)
-# What scans are matched by: elsewhere in `core`.
+# Modules of `core` for matching scans.
 SCANS = ('scans.kernels', 'scans.search_kernels')
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
-# What poses in space need besides; after the colon: the versions for them of that module's loops.
+# What poses in space need in addition: versions of a module's loops for arrays of other sizes.
 IN_SPACE = {'halpern': f'halpern{objects.SPACE}', 'cholesky': f'cholesky{objects.SPACE}',
              'blocks': f'blocks{objects.SPACE}', 'se2': 'se3'}
 
-# A process makes so many steps at least: to import numba takes as long as one of them.
+# Least number of steps for each process: importing numba takes as long as one step.
 _STEPS_EACH = 3
-# [s] How often the caller is asked whether to stop, and whether another process is done.
+# [s] Period of the checks whether to stop, and whether another process has finished.
 _LOOK = 0.1
-# [s] How long a process waits for another one that makes the same step.
+# [s] How long a process waits for another one that compiles the same step.
 _PATIENCE = 60.0
-# Of glibc's `mallopt`: from which size on an array has pages of its own, and how much may lie free
-# at the end of a heap. Left alone it raises both, to tens of megabytes for each thread.
+# Options of glibc's `mallopt`: the size from which an array gets pages of its own, and how much
+# may lie free at the end of a heap. By default glibc raises both, to tens of megabytes a thread.
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
-# [bytes] NumPy asks for huge pages from here on: then fresh ones cost no more than to reuse some.
+# [bytes] From this size on NumPy asks for huge pages: fresh ones cost as little as reused ones.
 _HUGE = 2**22
-# Other processes go first, though not by far: whoever waits for the loops waits for these.
+# Niceness of the compiling processes: low, because somebody waits for them.
 _NICE = 5
 
 
 def with_space(steps: tuple[str, ...], manifold: Manifold) -> tuple[str, ...]:
-    """Return the steps, and where the poses are not in the plane, what they need besides."""
+    """Return the steps, and those that poses of SE(3) need in addition."""
     if manifold.NAME == 'SE2':
         return steps
     return (*(IN_SPACE[step] for step in steps if step in IN_SPACE), *steps)
 
 
 def compile_now(steps: Sequence[str], quiet: bool = False) -> None:
-    """Compile some of `STEPS`, which takes long only at the first use on a machine."""
+    """Compile some of `STEPS` with a progress line; quick after the first use on a machine."""
     with Progress(None, 'part', quiet, 'compiling, once on this machine', delay=1.0) as progress:
         fill_cache(progress.reach, lambda: False, steps)
 
@@ -82,19 +81,19 @@ def compile_now(steps: Sequence[str], quiet: bool = False) -> None:
 def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
                steps: Sequence[str] = STEPS) -> bool:
     """
-    Compile what is not in the cache yet; returns at once where nothing is missing.
+    Compile the steps that are not in the cache yet; return at once if none is missing.
 
-    What is not compiled here, for whatever reason, is when it is first called.
+    A loop that is not compiled here, for whatever reason, is compiled when it is first called.
 
     Parameters
     ----------
-    report : called with how many steps are done, of how many: at first, and whenever one is
-    stopped : asked now and then; once it says yes, compiling ends and the call returns
-    steps : what is needed, of `STEPS`
+    report : called with the number of steps that are done and of all, at first and after each step
+    stopped : asked periodically; when it returns True, compiling ends and the call returns
+    steps : the steps that are needed, of `STEPS`
 
     Returns
     -------
-    whether all of it is in the cache now
+    whether all of these steps are in the cache now
 
     """
     known = _noted()
@@ -113,14 +112,14 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
 
 
 def _compiled(steps: list[str], stopped: Callable[[], bool]) -> Iterator[tuple[str, list[str]]]:
-    """Yield each step and the files that keep it, as processes are done with them."""
-    count = max(1, min(_cores(), len(steps) // _STEPS_EACH))
+    """Yield each step and its files in the cache, when a process has compiled it."""
+    count = max(1, min(cores(), len(steps) // _STEPS_EACH))
     workers = [_start(steps[first::count]) for first in range(count)]
     busy = {worker.stdout for worker in workers if worker.stdout}
     try:
         while busy and not stopped():
             for answers in select.select(busy, [], [], _LOOK)[0]:
-                # A process that is done, or broke, says nothing more; the others go on.
+                # A process that has finished or failed closes its output; the others go on.
                 if line := answers.readline():
                     step, files = json.loads(line)
                     yield step, files
@@ -133,7 +132,7 @@ def _compiled(steps: list[str], stopped: Callable[[], bool]) -> Iterator[tuple[s
 
 
 def _start(steps: list[str]) -> 'subprocess.Popen[str]':
-    """Start a process that finds its modules where this one does."""
+    """Start a process that compiles steps, with the module search path of this one."""
     code = (f'import sys; sys.path[:] = {sys.path!r}; '
             f'from l1slam_ros.io.compilation import work; work({steps!r})')
     return subprocess.Popen([sys.executable, '-c', code], stdin=subprocess.PIPE,
@@ -141,8 +140,8 @@ def _start(steps: list[str]) -> 'subprocess.Popen[str]':
 
 
 def work(steps: list[str]) -> None:
-    """Make some steps ready, each said on standard output; end when the parent does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a person's Ctrl-C is for the parent
+    """Compile steps and print a line for each; end when the parent process ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     os.nice(_NICE)
 
     def end_with_parent() -> None:
@@ -150,29 +149,29 @@ def work(steps: list[str]) -> None:
         os._exit(0)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-    # What numba makes it holds on to: to look for garbage takes a tenth of the time, in vain.
+    # numba keeps all that it makes, so searching for garbage would waste a tenth of the time.
     gc.disable()
     for step in steps:
         print(json.dumps([step, make(step)]), flush=True)
 
 
 def make(step: str) -> list[str]:
-    """Compile a step if no other process does; return the files that keep it."""
+    """Compile a step unless another process has; return its files in the cache."""
     with alone(step):
         return compiled.keep(step)
 
 
 @contextmanager
 def alone(step: str) -> Iterator[None]:
-    """Keep other processes from making a step for the same folder; wait until none does."""
+    """Hold a lock on a step of the cache folder, so that only one process compiles it."""
     with ExitStack() as held:
-        with suppress(ImportError, OSError, StopIteration):  # nowhere to lock
+        with suppress(ImportError, OSError, StopIteration):  # no lock is possible
             import fcntl
 
             folder = next(filter(objects.is_writable, objects.folders()))
             path = folder / objects.file_name(f'{step}.lock')
             file = held.enter_context(path.open('w'))
-            # Whoever holds it may be stopped, by Ctrl-Z: then both make it.
+            # The holder may be stopped by Ctrl-Z: then both compile the step.
             end = time.monotonic() + _PATIENCE
             while time.monotonic() < end:
                 with suppress(BlockingIOError):
@@ -183,34 +182,34 @@ def alone(step: str) -> Iterator[None]:
 
 
 def load(steps: Sequence[str] = STEPS) -> None:
-    """Read the loops of some steps into a process that is to keep a map."""
+    """Load the compiled loops of some steps, and prepare the memory of a process with a map."""
     for step in steps:
         make_ready(step)
-    # Some 100,000 objects that stay: to look at them for garbage takes a tenth of a second.
+    # Some 100,000 objects stay; each search of them for garbage would take a tenth of a second.
     gc.collect()
     gc.freeze()
     with suppress(AttributeError, OSError):  # another C library
         ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _HUGE)
-        # As it would by itself.
+        # The ratio that glibc itself keeps between the two.
         ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, 2 * _HUGE)
 
 
 def make_ready(step: str) -> None:
-    """Link the loops of one step, or have them read or compiled."""
+    """Link the loops of one step from the cache, or let numba read or compile them."""
     module = import_module(objects.module_of(step))
     for loop in list(vars(module).values()):
         if hasattr(loop, 'takes'):
             compiled.make_ready(loop, step.endswith(objects.SPACE))
 
 
-def _cores() -> int:
-    """Return how many processors this process may use."""
+def cores() -> int:
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
         os.cpu_count() or 1)
 
 
 def _noted() -> dict[str, list[str]]:
-    """Return the steps that are in the cache, and the files that keep each."""
+    """Return the steps that are in the cache, and the files of each."""
     for folder in objects.folders():
         try:
             note = json.loads((folder / objects.file_name('json')).read_text())
@@ -223,11 +222,11 @@ def _noted() -> dict[str, list[str]]:
 
 
 def _note(steps: dict[str, list[str]]) -> None:
-    """Write down what is in the cache; a reader finds all of the note or none."""
+    """Write the note of what is in the cache, whole or not at all."""
     note = {'key': _key(), 'steps': steps}
     objects.put(objects.file_name('json'), json.dumps(note).encode())
 
 
 def _key() -> str:
-    """Return what changes with the sources; on the rest depends how the note is called."""
+    """Return a digest of the sources; Python, numba and machine are in the name of the note."""
     return hashlib.sha256(repr(objects.sources()).encode()).hexdigest()

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What the text files of this package share: lines of numbers in, whole files out.
+Functions for text files: read lines of numbers, write a file whole or not at all.
 
-Numbers are converted in bulk, so a graph of 700,000 edges reads in seconds; only when a bulk
-fails is its guilty line looked for, to be named.
+Numbers are converted in bulk, so a graph of 700,000 edges is read in seconds. Only when the
+conversion fails is the malformed line searched for, to be named.
 """
 
 import os
@@ -34,20 +34,21 @@ from l1slam_ros.io.remarks import Remarks, read_remarks
 NANOSECONDS = 10**9
 # [ns] builtin_interfaces/Time holds its seconds in 32 bits.
 LAST_STAMP = 2**31 * NANOSECONDS - 1
-# No pose or information is beyond this, and with less no square of one leaves the doubles.
+# Largest absolute value that is read: no pose or information exceeds it, and squares stay finite.
 LARGEST = 1e30
-# The longest piece of a damaged file that is quoted in an error.
+# Largest number of characters of a file that are quoted in an error.
 _QUOTED = 40
-# So many lines are formatted in one go.
+# Number of lines that are formatted at once.
 _AT_ONCE = 500
 
 
 @dataclass(frozen=True)
 class TextLines:
     """
-    Lines of a file: their numbers, from 1, and their texts.
+    The lines of a file without comments: their numbers, from 1, and their texts.
 
-    remarks : of a saved map; comments : number and text of each comment line.
+    remarks : the state of a saved map, see `remarks.py`; comments : number and text of each
+    comment line.
     """
 
     numbers: list[int]
@@ -58,7 +59,7 @@ class TextLines:
 
 @contextmanager
 def reported(path: object, done: str = 'written') -> Iterator[None]:
-    """Let what the system refuses name the file: as one that cannot be written, or read."""
+    """Turn an OSError of the block into a FileError: `path` cannot be written (or read, ...)."""
     try:
         yield
     except OSError as error:
@@ -74,13 +75,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Raises
     ------
-    FileError : naming `path`; whatever goes wrong, `path` is then as it was before.
+    FileError : `path` cannot be written; it is then unchanged, as after any other error.
 
     """
     target = Path(os.path.realpath(path))
     if kind := other_kind(target):
         raise FileError(path, f'cannot be written: it is {kind}')
-    # Not `tempfile`: its files are for their owner only, whatever the umask says.
+    # Not `tempfile`, whose files only their owner may read, whatever the umask is.
     temporary = target.parent / f'.{target.name}.{secrets.token_hex(4)}.tmp'
     try:
         with reported(path):
@@ -94,14 +95,14 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def new_folder_beside(target: Path) -> Iterator[Path]:
-    """Yield a new folder beside `target`, gone in the end with all that is still in it."""
+    """Yield a new temporary folder beside `target`; it is removed with its content in the end."""
     with TemporaryDirectory('.tmp', f'.{target.name}.', target.absolute().parent,
                             ignore_cleanup_errors=True) as folder:
         yield Path(folder)
 
 
 def sync_folder(folder: Path) -> None:
-    """Let no power cut undo what was renamed in a folder, where its file system can do that."""
+    """Flush the renames in a folder to the disk, if its file system supports that."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -111,7 +112,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def require_folder(path: str | os.PathLike[str]) -> None:
-    """Refuse, before any work is done, to write where there is no folder, or none to write in."""
+    """Check, before any work is done, that the folder of `path` exists and can be written to."""
     folder = Path(os.path.realpath(path)).parent
     if not folder.is_dir():
         raise FileError(path, f'cannot be written: {folder} is no folder')
@@ -120,34 +121,35 @@ def require_folder(path: str | os.PathLike[str]) -> None:
 
 
 def require_file(path: str | os.PathLike[str]) -> None:
-    """Refuse, before any work is done, to write a file where none can be."""
+    """Check, before any work is done, that a file can be written to `path`."""
     require_folder(path)
     if kind := other_kind(path):
         raise FileError(path, f'cannot be written: it is {kind}')
 
 
 def other_kind(path: str | os.PathLike[str]) -> str:
-    """Return what is in the place of a file that is none to be replaced, or read to its end."""
-    # Not the functions of `Path`: those raise where a name is too long.
+    """Return what `path` is if it exists and is not a regular file, in words; else nothing."""
+    # Not the functions of `Path`: they raise if a name is too long.
     if os.path.isfile(path) or not os.path.exists(path):
         return ''
-    return 'a directory' if os.path.isdir(path) else 'no regular file'
+    return 'a directory' if os.path.isdir(path) else 'not a regular file'
 
 
 def put_lines(path: Path, lines: Iterable[str]) -> None:
-    """Write lines to a file of our own, onto the disk; each gets its newline here."""
+    """Write lines to a file, add a newline to each, and flush the file to the disk."""
     with path.open('w', encoding='utf-8') as file:
         file.writelines(f'{line}\n' for line in lines)
         file.flush()
-        # Or a power cut just after the file is put in its place could leave it empty.
+        # Without this, a power cut just after the file is renamed could leave it empty.
         os.fsync(file.fileno())
 
 
 def formatted(line: str, *columns: np.ndarray) -> list[str]:
     """
-    Return `line % row` for each row of some tables (m, k) side by side, many lines to a string.
+    Return `line % row` for each row of the tables (m, k), put side by side; many lines a string.
 
-    To format many at once takes a third less time than one by one; more would hold up others.
+    To format many lines at once takes a third less time than one by one. A larger number would
+    hold Python's lock for too long.
     """
     parts = (np.concatenate([table[k : k + _AT_ONCE].astype(object) for table in columns], axis=1)
              for k in range(0, len(columns[0]), _AT_ONCE))
@@ -169,11 +171,11 @@ def write_lines(path: str | os.PathLike[str], lines: Iterable[str]) -> None:
 
 def read_lines(path: str | os.PathLike[str]) -> TextLines:
     """
-    Return the lines of a text file, blank ones left out, and `#` comments apart.
+    Return the lines of a text file without blank lines; `#` comments are returned separately.
 
     Raises
     ------
-    FileError : the file cannot be read, is no text, or is a saved map that is damaged.
+    FileError : the file cannot be read, is not text, or is a saved map that is damaged.
 
     """
     with reported(path, 'read'):
@@ -194,12 +196,12 @@ def read_lines(path: str | os.PathLike[str]) -> TextLines:
 
 
 def counted(count: int, noun: str, plural: str = '') -> str:
-    """Return e.g. `1 loop`, `1,837 loops`; plural : where it is not the noun and an s."""
+    """Return e.g. `1 loop` or `1,837 loops`; plural : of the noun, if not formed with an s."""
     return f'{count:,} {noun if count == 1 else plural or noun + "s"}'
 
 
 def quoted(text: str) -> str:
-    """Return a piece of a file as an error quotes it: printable, on one line, not too long."""
+    """Return a piece of a file as it is quoted in errors: printable, on one line, shortened."""
     return repr(text if len(text) <= _QUOTED else text[:_QUOTED] + '...')
 
 
@@ -214,7 +216,7 @@ def parse_rows(path: object, name: str, lines: TextLines, ids: int,
 
     Raises
     ------
-    FileError : naming the first bad line; `name` says in it what the line should have been.
+    FileError : naming the first malformed line; `name` says what kind of line was expected.
 
     """
     dtype = np.dtype([('ids', np.int64, (ids,)), ('values', np.float64, (values,))])
@@ -230,7 +232,7 @@ def parse_rows(path: object, name: str, lines: TextLines, ids: int,
 
 
 def refuse_quaternions(path: object, quaternions: Array, numbers: list[int]) -> None:
-    """Refuse the first of the quaternions (m, 4), at lines (m,), whose norm is far from 1."""
+    """Raise for the first of the quaternions (m, 4) whose norm is not 1; numbers : their lines."""
     far = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > QUATERNION_NORM_ERROR
     if far.any():
         k = int(np.argmax(far))
@@ -239,7 +241,7 @@ def refuse_quaternions(path: object, quaternions: Array, numbers: list[int]) -> 
 
 
 def first_failure(count: int, works: Callable[[slice], bool]) -> int:
-    """Return the first of `count` rows that fails, by bisection; `works` judges a slice."""
+    """Return the first of `count` rows that fails, by bisection; `works` tests a slice."""
     low = 0
     high = count
     while high - low > 1:
@@ -252,7 +254,7 @@ def first_failure(count: int, works: Callable[[slice], bool]) -> int:
 
 
 def invented_stamps(n: int) -> Indices:
-    """Return stamps [ns] for n poses that have none: 1000 s, then ten poses a second, (n,)."""
+    """Return stamps [ns], (n,), for poses without stamps: ten poses a second from 1000 s on."""
     return 1000 * NANOSECONDS + np.arange(n, dtype=np.int64) * (NANOSECONDS // 10)
 
 
@@ -264,11 +266,11 @@ def stamp_text(stamp: int) -> str:
 
 def stamp_from_text(text: str) -> int:
     """
-    Return the stamp [ns] of a decimal number of seconds, rounded from its text, not from a float.
+    Return the stamp [ns] of a decimal number of seconds, exact to the nanosecond.
 
     Raises
     ------
-    ValueError : no number of seconds that 64 bits of nanoseconds hold.
+    ValueError : the text is not a number, or its nanoseconds do not fit into 64 bits.
 
     """
     try:
@@ -282,10 +284,9 @@ def stamp_from_text(text: str) -> int:
 
 def rounded(values: Array) -> Array:
     """
-    Return the 15-digit decimal next to each value where rounding cannot tell the two apart.
+    Round each value to 15 decimal digits if that changes it by rounding errors only.
 
-    For numbers that come out of a computation: a root that is squared again makes
-    50.00000000000001 of a 50.
+    For computed numbers: the square of a square root turns 50 into 50.00000000000001.
     """
     magnitude = np.abs(np.where(values == 0.0, 1.0, values))
     # Powers up to 10^22 are exact, so the quotient is the double nearest to the decimal.
@@ -296,26 +297,26 @@ def rounded(values: Array) -> Array:
 
 
 def _convert(texts: list[str], dtype: np.dtype) -> np.ndarray | None:
-    """Return the rows as a structured array, or None when any of them is not as it should be."""
+    """Return the rows as a structured array, or None if any of them is malformed."""
     rows = _numbers(texts, dtype)
-    # Written so that NaN fails too.
+    # Written so that NaN fails, too.
     if rows is None or not (np.abs(rows['values']) <= LARGEST).all():
         return None
     return rows
 
 
 def _numbers(texts: list[str], dtype: np.dtype) -> np.ndarray | None:
-    """Return the rows as a structured array, or None when any of them has other fields."""
+    """Return the rows as a structured array, or None if any of them has other fields."""
     if not texts:
         return np.empty(0, dtype)
     with warnings.catch_warnings():
-        # NumPy warns where it should fail: no data, and (before 2.0) an id such as 1.5.
+        # NumPy only warns about missing data and, before 2.0, about an id such as 1.5.
         warnings.simplefilter('error')
         try:
             rows: np.ndarray = np.loadtxt(texts, dtype, ndmin=1, encoding=None)
         except (ValueError, Warning):
             return None
-    # `loadtxt` passes over rows without any field.
+    # `loadtxt` skips rows without any field.
     return rows if len(rows) == len(texts) else None
 
 

@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Any input file -> graph, and a graph -> any output file; nothing is solved here.
+Reading a graph from any input file, and writing one to any output file.
 
-In the end `l1slam_ros.read_graph` and `write_graph`.
+`l1slam_ros.read_graph` and `write_graph` are at the end.
 """
 
 import os
@@ -58,8 +58,8 @@ def _read_jrl_file(path: Path, rotation_information: str) -> GraphRecord:
     return read_jrl_file(path, rotation_information)
 
 
-# By the suffix of a file. A reader takes the path and what the rotation block of the information
-# is of, and raises FileError.
+# Suffix -> reader. A reader takes the path and `rotation_information`, see `GraphRecord`, and
+# raises FileError.
 GRAPH_READERS: dict[str, Callable[[Path, str], GraphRecord]] = {
     '.g2o': read_graph_file,
     '.jrl': _read_jrl_file,
@@ -68,12 +68,12 @@ GRAPH_READERS: dict[str, Callable[[Path, str], GraphRecord]] = {
 }
 
 
-# Of CARMEN logs with scans, packed or not.
+# Suffixes of CARMEN logs with scans, packed or not.
 LOG_SUFFIXES = ('.clf', '.log', '.bz2', '.gz')
 
 
 class _Origin(NamedTuple):
-    """What the file of a graph says besides; see `GraphRecord`."""
+    """The content of a file that is not in the `FactorGraph`; the fields are of `GraphRecord`."""
 
     ids: Indices
     stamps: Indices | None = None
@@ -82,7 +82,7 @@ class _Origin(NamedTuple):
     log: RobotLog | None = None
 
 
-# By the graphs that `read_graph` returned, which know nothing of files.
+# For each graph that `read_graph` returned, what `write_graph` writes besides.
 _ORIGINS: WeakKeyDictionary[FactorGraph, _Origin] = WeakKeyDictionary()
 
 
@@ -94,16 +94,16 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
 
     Parameters
     ----------
-    path : .g2o, .graph, .jrl, its .cbor, .mcap, .db3, .bag (ROS 1) or a rosbag2 directory
-    options : what makes keyframes of a bag's messages; None: the node's defaults. Where the bag's
-        note says it otherwise, defaults give way
-    topics : where in a bag to look
-    rotation_information : see `GraphRecord`; written back it is as it was read
-    dimension : of the world of a bag that does not note it
+    path : .g2o, .graph, .jrl, .cbor, .mcap, .db3, .bag (ROS 1) or a rosbag2 directory
+    options : how messages of a bag become keyframes; None: the node's defaults. A note in the bag
+        replaces defaults
+    topics : the topics of a bag
+    rotation_information : see `GraphRecord`; the record keeps it for writing
+    dimension : of the poses of a bag (2 or 3), unless the bag notes it
 
     Raises
     ------
-    FileError : it cannot be read, or there is no graph in it.
+    FileError : the file cannot be read, or holds no graph.
 
     """
     if not path.exists():
@@ -114,7 +114,7 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
 
         record = graph_from_bag(path, options, topics, dimension)
         return replace(record, rotation_information=rotation_information)
-    # The map before the one of that name, too.
+    # `map.g2o.1` is the previous map of the node.
     name = path.name.lower().removesuffix('.1')
     for suffix, read in GRAPH_READERS.items():
         if name.endswith(suffix):
@@ -124,22 +124,22 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether an input is taken for a bag."""
+    """Tell whether an input is read as a bag."""
     return path.is_dir() or path.suffix.lower() in BAG_SUFFIXES
 
 
 def is_log(path: Path) -> bool:
-    """Tell whether an input is taken for a log of scans, see `io.scans`."""
+    """Tell whether an input is read as a log of scans, see `io.scans`."""
     return path.is_file() and path.suffix.lower() in LOG_SUFFIXES
 
 
 def stored_poses(record: GraphRecord) -> Array:
-    """Return the stored start, (n, p), or what comes in its place; see `initial_poses`."""
+    """Return the poses (n, p) that the input stores, else those of `initial_poses`."""
     return initial_poses(record.graph, record.poses, record.ids)
 
 
 def with_poses(record: GraphRecord) -> GraphRecord:
-    """Return the record with `stored_poses`; as it is where there are none to be had."""
+    """Return the record with `stored_poses`; unchanged if there are none."""
     try:
         return replace(record, poses=stored_poses(record))
     except GraphError:
@@ -148,7 +148,7 @@ def with_poses(record: GraphRecord) -> GraphRecord:
 
 @contextmanager
 def named(path: Path | str) -> Iterator[None]:
-    """Let what is wrong with a graph name the file it came from."""
+    """Turn a GraphError of the block into a FileError that names the file of the graph."""
     try:
         yield
     except GraphError as error:
@@ -156,21 +156,25 @@ def named(path: Path | str) -> Iterator[None]:
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return an input and all that may be read beside it."""
+    """Return an input and the files beside it that may be read with it."""
     return [path, *(beside(path, what) for what in BESIDE)]
 
 
 def check_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
                  also: tuple[str, ...] = ()) -> None:
     """
-    Refuse, before any work is done, an output that could not be written in the end.
+    Check, before any work is done, that an output can be written.
 
     Parameters
     ----------
     path : see `write_output`
-    inputs : what is read, and never written
-    force : whether to replace what others wrote
-    also : what will be written beside it besides, as `truth`
+    inputs : the files that are read; they are never replaced
+    force : whether to replace files of other programs
+    also : further files that will be written beside it, such as `truth`
+
+    Raises
+    ------
+    FileError : it cannot be written, or would replace an input or a file of another program.
 
     """
     suffix = path.suffix.lower()
@@ -194,7 +198,7 @@ def check_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
 
 def check_graph_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
                        also: tuple[str, ...] = ()) -> None:
-    """Refuse, as `check_output`, an output that does not hold a graph."""
+    """Do the checks of `check_output`, and refuse a format that holds no graph."""
     check_output(path, inputs, force, also)
     if path.suffix.lower() == '.tum':
         raise FileError(path, 'a trajectory has no edges; expected .g2o, '
@@ -204,10 +208,10 @@ def check_graph_output(path: Path, inputs: Iterable[Path] = (), force: bool = Fa
 def write_output(path: Path, record: GraphRecord, truth: Array | None = None,
                  force: bool = False, scans: 'Sequence[Scan]' = ()) -> None:
     """
-    Write a graph with its poses, in the format that the suffix names; none: a bag.
+    Write a graph with its poses in the format of the suffix; without a suffix, a bag.
 
-    truth : (n, p) poses, which bags and JRL files have a place for; force : whether to replace
-    what others wrote; scans : see `write_graph_bag`; only a bag has a place for them
+    truth : (n, p) true poses, written to bags and JRL files only; force : whether to replace files
+    of other programs; scans : see `write_graph_bag`, written to bags only
 
     Raises
     ------
@@ -234,25 +238,24 @@ def read_graph(path: str | os.PathLike[str], *, odom_topic: str = DEFAULT_TOPICS
                loop_topic: str = DEFAULT_TOPICS.loops, rotation_information: str = QUATERNION,
                ) -> tuple[FactorGraph, Array | None]:
     """
-    Return the graph in a file, and the poses (n, p) that it stores, None where none.
+    Return the graph in a file, and the poses (n, p) stored with it, or None.
 
-    Poses are x y theta [m, rad] in the plane, x y z qx qy qz qw in space.
-
-    Keyframes are numbered from 0, in the order of the file's vertex ids. What was skipped, or lost
-    where a bag is damaged, is warned of.
+    Poses are x y theta [m, rad] in the plane, and x y z qx qy qz qw [m, quaternion] in space.
+    Keyframes are numbered from 0, in the order of the vertex ids of the file. Lines and messages
+    that are skipped, and damage of a bag, are reported as Python warnings.
 
     Parameters
     ----------
-    path : .g2o, TORO .graph, .jrl or its .cbor, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1
-    odom_topic, loop_topic : where a bag has its odometry and its loops, or pose graphs of a front
-        end, see `l1slam solve --help`; of a graph file they say nothing
-    rotation_information : what the rotation block of the information in a 3D g2o file is of,
-        `quaternion`, its vector part, as g2o has it, or `angle`
+    path : .g2o, TORO .graph, .jrl, .cbor, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1
+    odom_topic, loop_topic : of a bag: the topics of the odometry and of the loops, or of the pose
+        graph of a front end, see `l1slam solve --help`
+    rotation_information : the rotation block of the information in a 3D g2o file is that of the
+        quaternion's vector part, `quaternion`, as in g2o, or that of the angle, `angle`
 
     Raises
     ------
     FileError : naming file and line, what was found and what was expected.
-    OptionError : an argument is of another kind.
+    OptionError : an argument has the wrong type or value.
 
     """
     _check_reading(path, rotation_information)
@@ -273,25 +276,24 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     """
     Write a graph with poses (n, p), whole or not at all.
 
-    A graph of `read_graph` keeps the ids, stamps and comments that it came with, as long as it has
-    as many keyframes.
+    A graph of `read_graph` keeps its ids, stamps and comments, as long as the number of its
+    keyframes is the same.
 
     Parameters
     ----------
-    path : .g2o, .jrl or its .cbor, .tum (the poses alone), or a name without a suffix for a bag
-        directory
+    path : .g2o, .jrl, .cbor, .tum (the poses alone), or a name without suffix for a bag directory
     rotation_information : see `read_graph`
-    inliers : (m,) bool of the factors, as of a `Solution`: the others are written as what was left
-        out, which other programs do not use; None: those of the solution whose poses these are, or
-        else those that were left out in the file read
-    force : whether to replace what was there, though this program did not write it
+    inliers : (m,) bool, as in a `Solution`: the other factors are written such that other programs
+        do not use them. None: the inliers of the solution with these poses; without one, the
+        factors that were left out in the file that was read stay left out
+    force : whether to replace a file that this program did not write
 
     Raises
     ------
-    FileError : it cannot be written, would replace what others wrote, or the format has no place
-        for a part of the graph.
-    GraphError : poses or inliers of another shape, or poses that are not finite.
-    OptionError : an argument is of another kind.
+    FileError : the file cannot be written, would replace a file of another program, or the format
+        has no place for a part of the graph.
+    GraphError : poses or inliers have the wrong shape, or a pose is not finite.
+    OptionError : an argument has the wrong type or value.
 
     """
     _check_reading(path, rotation_information)
@@ -314,7 +316,7 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
             raise GraphError(f'inliers have the shape {np.shape(inliers)}, expected '
                              f'{(len(factors),)}')
         left_out = left_out_of(np.asarray(inliers, bool), factors)
-    elif left_out is not None:  # what was appended since is believed
+    elif left_out is not None:  # factors appended since are used
         left_out = np.concatenate((left_out, nothing_left_out(len(factors) - len(left_out))))
     write_output(Path(path), GraphRecord(
         graph, poses, origin.ids, origin.stamps, left_out=left_out,

@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-How much memory a process can still take: of the machine, its control groups, its own limit.
+How much memory this process can still take: of the machine, its control groups and its own limit.
 
-In: what Linux tells in files. Out: bytes; infinite where nothing is told.
+In: files of Linux in /proc and /sys. Out: bytes; infinite where there are no such files.
 """
 
 import ctypes

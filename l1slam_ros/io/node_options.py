@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What the node can be told, and the YAML file that tells it; without ROS, for `l1slam` too."""
+"""The options of the node and its parameter file; without ROS, so that `l1slam` reads it, too."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -22,15 +22,15 @@ from l1slam_ros.core.options import Options, Scalar, dotted, option
 from l1slam_ros.core.running.backend import BackendOptions
 from l1slam_ros.io.bounded import read_yaml
 
-# Of a robot: it begins names of topics.
+# A robot's name, which topics begin with.
 _NAME = re.compile('[A-Za-z][A-Za-z0-9_]*')
-# The name of the node, unless it was given another.
+# The default name of the node.
 _NODE = 'backend'
 
 
 @dataclass(frozen=True)
 class UpdateOptions(Options):
-    """When the node works."""
+    """How often the node updates the map, and how long an update may take."""
 
     period: float = option(
         0.2, 'time from the begin of one update to the begin of the next', 's', 1e-3, 3600,
@@ -40,7 +40,7 @@ class UpdateOptions(Options):
 
 @dataclass(frozen=True)
 class NodeOptions(BackendOptions):
-    """Everything the node can be told: the back end's options and its own."""
+    """All options of the node: those of the back end, and its own."""
 
     PASSED_OVER = OF_ROS
 
@@ -71,20 +71,20 @@ class NodeOptions(BackendOptions):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of robots, none: there is one without a name."""
+        """The names of the robots; empty for a single robot without a name."""
         return () if self.robots == ('',) else self.robots
 
     def __post_init__(self) -> None:
-        """Check every field, and those that only make sense together."""
+        """Check every field, and the fields that depend on each other."""
         super().__post_init__()
         for name in ('map_frame', 'odom_frame', 'base_frame'):
-            # As tf2 has them.
+            # tf2 has no leading slash.
             object.__setattr__(self, name, getattr(self, name).removeprefix('/'))
         frames = self.map_frame, self.odom_frame
         if '' in frames or frames[0] == frames[1]:
             raise OptionError(f'map_frame is {frames[0]!r} and odom_frame {frames[1]!r}, expected '
                               'two different names')
-        # In a parameter file ROS reads no list of nothing.
+        # ROS cannot read an empty list from a parameter file.
         object.__setattr__(self, 'robots', self.robots or ('',))
         wrong = not all(_NAME.fullmatch(name) for name in self.names)
         if wrong or len({*self.names}) < len(self.robots) > 1:
@@ -96,11 +96,11 @@ class NodeOptions(BackendOptions):
 
 def read_params_file(path: Path) -> NodeOptions:
     """
-    Return the options that a ROS parameter file sets for the node, or for any if not by its name.
+    Return the options that a ROS parameter file sets for the node, by its name or for all nodes.
 
     Raises
     ------
-    FileError : it cannot be read, is no parameter file, or sets something that is refused.
+    FileError : it cannot be read, is not a parameter file, or sets a value that is refused.
 
     """
     try:

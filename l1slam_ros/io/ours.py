@@ -7,16 +7,16 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What this program may replace: what it wrote, told by a mark in it, and nothing else.
+Which files this program may replace: those that it wrote, recognised by a mark in them.
 
-    text              a comment, `MARK`, the first line, of a graph the last: GTSAM reads no edge
-                      behind a comment; of a saved map the lines of `remarks`
+    text              the comment `MARK` as the first line; in a graph as the last line, because
+                      GTSAM reads no edge behind a comment; in a saved map the lines of `remarks`
     report            the first line, `REPORT_MARK`
     .jrl, .cbor       the last text, `WROTE`
-    .png, .svg, .pdf  the field for the program that drew the picture; of a .pgm a comment
+    .png, .svg, .pdf  the metadata field for the program; in a .pgm a comment
     bag directory     in each .mcap the field for the library that wrote it
 
-The shape of a file tells nothing: a recording or a graph of another program looks just the same.
+A mark is needed because recordings and graphs of other programs look just the same.
 """
 
 import os
@@ -33,17 +33,17 @@ WROTE = f'{PROGRAM} wrote this file and may replace it'
 MARK = f'# {WROTE}'
 REPORT_MARK = f'<!-- {WROTE} -->'
 _FIRST_LINES = f'{MARK}\n'.encode(), f'{REPORT_MARK}\n'.encode()
-# The begin of a file -> what tells ours from others: PNG, PDF, SVG.
+# First bytes of a file -> the mark in it: PNG, PGM, PDF, SVG.
 _PICTURES = {
     b'\x89PNG': f'tEXtSoftware\0{PROGRAM}'.encode(),
     b'P5\n': f'\n{MARK}\n'.encode(),
     b'%PDF': f'/Creator ({PROGRAM})'.encode(),
     b'<?xml': f'<dc:title>{PROGRAM}</dc:title>'.encode()}
-# Magic, and a header record of 22 bytes: the profile and the library, each with its length.
+# MCAP magic, and a header record of 22 bytes: the profile and the library, each with its length.
 _BAG = (b'\x89MCAP0\r\n\x01' + (22).to_bytes(8, 'little') + b'\x04\0\0\0ros2\x0a\0\0\0'
         + PROGRAM.encode())
 _METADATA = 'metadata.yaml'
-# [bytes] Of a file so much is looked at, at its begin and at its end.
+# [bytes] at the begin and at the end of a file that are searched for a mark.
 _ENOUGH = 2**16
 
 
@@ -54,7 +54,7 @@ def marked(lines: Iterable[str]) -> Iterator[str]:
 
 def is_ours(path: str | os.PathLike[str]) -> bool:
     """
-    Tell whether this program wrote a file or a bag directory, or there is nothing in it.
+    Tell whether this program wrote a file or a bag directory, or the file is empty.
 
     Raises
     ------
@@ -86,13 +86,13 @@ def _ends(path: str | os.PathLike[str]) -> tuple[bytes, bytes]:
 def refuse_others(outputs: Iterable[str | os.PathLike[str]],
                   inputs: Iterable[str | os.PathLike[str]] = (), force: bool = False) -> None:
     """
-    Refuse outputs in the place of what somebody else wrote, or of an input.
+    Refuse outputs that would replace an input or a file of another program.
 
     Parameters
     ----------
-    outputs : all that will be written, or removed because it is not written
-    inputs : all that may be read; none of them is an output, even by another name of the file
-    force : whether to replace what others wrote
+    outputs : all files that will be written or removed
+    inputs : all files that may be read; none may be an output, not even under another name
+    force : whether to replace files of other programs
 
     Raises
     ------
@@ -113,7 +113,7 @@ def refuse_others(outputs: Iterable[str | os.PathLike[str]],
 
 
 def _is_part(output: str | os.PathLike[str], path: str | os.PathLike[str]) -> bool:
-    """Tell whether an input is an output, lies in it, or has it as a file of its own."""
+    """Tell whether an input is the output, lies in it, or is a directory that contains it."""
     if not os.path.exists(output):
         return False
     if os.path.isdir(output) and Path(os.path.realpath(output)) in Path(

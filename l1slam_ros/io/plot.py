@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Pictures: maps beside each other, and costs against iterations.
+Pictures of maps, side by side, and of costs against iterations.
 
 In: positions, pairs of keyframes, costs. Out: a .png, .svg or .pdf file. Colours are those of
 Okabe and Ito, which people who see red and green alike can tell apart.
@@ -82,13 +82,13 @@ class Ground:
 @dataclass(frozen=True)
 class MapDrawing:
     """
-    What one map shows, seen from above where it is not said otherwise.
+    The content of one map, by default seen from above.
 
-    positions, odometry : (n, 2 or 3) [m]; truth : (l, 2 or 3) [m] a path, rows of NaN part it;
-    loops, suspect, rejected, false : (m, 2) pairs of rows of `positions`, each loop in one of
-    them: `false` those known to be which were not rejected; name : what the positions are; note :
-    more for the line under the title, e.g. costs; upwards : the axis that is; ground : what lies
-    under all of it.
+    positions, odometry : (n, 2 or 3) [m]; truth : (l, 2 or 3) [m] a path, interrupted by rows of
+    NaN; loops, suspect, rejected, false : (m, 2) pairs of rows of `positions`, each loop in one of
+    these arrays; `false` has the loops known to be false that were not rejected; name : of the
+    positions, in the legend; note : text under the title, e.g. costs; upwards : the axis that
+    points up; ground : an occupancy grid under the map.
     """
 
     title: str
@@ -229,7 +229,7 @@ def _write_title(axes: Axes, title: str, small_print: str) -> None:
 
 
 def _draw_map(axes: Axes, drawing: MapDrawing) -> None:
-    """Draw from the ground up: what was believed, what is true, what is refused, what came out."""
+    """Draw, from bottom to top, the loops, the truth, the refused loops and the positions."""
     if drawing.ground is not None:
         _draw_ground(axes, drawing.ground)
     if drawing.odometry is not None:
@@ -321,7 +321,7 @@ def _opacity(count: int) -> float:
 
 
 def _set_view(axes: Axes, drawing: MapDrawing) -> None:
-    """Show the map and the truth whole, the odometry as far as it stays in their neighbourhood."""
+    """Show the whole map and truth, and the odometry as far as it stays near them."""
     seen = [drawing.positions] if drawing.truth is None else [drawing.positions, drawing.truth]
     points = np.concatenate([positions[:, :2] for positions in seen])
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)

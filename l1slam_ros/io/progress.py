@@ -19,22 +19,22 @@ _PATIENCE, _APART = 3.0, 5.0
 
 
 def say(sentence: str) -> None:
-    """Print a line to standard error; who read there may have gone."""
+    """Print a line to standard error, which may have been closed."""
     with suppress(BrokenPipeError):
         print(f'l1slam: {sentence}', file=sys.stderr, flush=True)
 
 
 class Progress:
     """
-    Shows how far some work is; a context manager.
+    Shows the progress of some work; a context manager.
 
     Parameters
     ----------
-    total : how many steps there are at most; None: nobody knows
-    unit : what one step is called
+    total : largest number of steps; None: unknown
+    unit : name of a step
     quiet : show nothing
-    label : what is being done; without, there is no line in a log
-    delay : [s] show no bar of what is done sooner
+    label : name of the work; without it nothing is written to a log
+    delay : [s] before the bar appears; shorter work shows none
 
     """
 

@@ -7,15 +7,15 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What a saved map says that no graph format has a tag for, in lines that others take for comments.
+The state of a saved map that graph formats have no tag for, as lines that are comments to others.
 
-    ... #L1SLAM map 3           ends the first line: the version. It has no line of its own, for
-                                GTSAM reads no edge behind a comment; version 2 had
-    #L1SLAM <name> <JSON>       a value; of one with many rows the first, and more in lines to come
-    #L1SLAM <name> <f8 <Base64> the numbers of an array, of NumPy's type `<f8`; more to come, too
-    #L1SLAM sha256 <digest>     the last line: of all bytes before, the proof that they are whole
+    ... #L1SLAM map 3           at the end of the first line: the version. It has no line of its
+                                own, because GTSAM reads no edge behind a comment
+    #L1SLAM <name> <JSON>       a value; a value with many rows continues in lines of this name
+    #L1SLAM <name> <f8 <Base64> the numbers of an array of NumPy's type `<f8`; may be continued
+    #L1SLAM sha256 <digest>     the last line: checksum of all bytes before it
 
-As text numbers would take most of the time of saving.
+Arrays are in Base64, because writing numbers as text would take most of the time of a save.
 """
 
 import json
@@ -45,7 +45,7 @@ _ENOUGH = 2**20
 
 
 def with_remarks(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines of a file that says some values, too, many to a string; see `_unproven`."""
+    """Yield the lines of a file with some values and its checksum, many to a string."""
     digest = sha256()
     for text in _together(_unproven(lines, values)):
         digest.update(f'{text}\n'.encode())

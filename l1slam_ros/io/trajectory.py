@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Trajectories as text: TUM files for other tools, references to be measured against.
+Trajectories as text: writing TUM files, and reading reference poses to compare with.
 
 TUM: `stamp x y z qx qy qz qw`, stamps in seconds, exact to the nanosecond.
 """
@@ -79,16 +79,16 @@ def truth_lines(ids: Indices, poses: Array) -> Iterator[str]:
 def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
                    by_stamps: bool = False) -> Reference:
     """
-    Read reference poses: TUM, a graph file's vertices, `id x y theta`, or `stamp, x, y, theta`.
+    Read reference poses: TUM, vertices of a graph, `id x y theta`, or CSV `stamp, x, y, theta`.
 
-    Of a JRL file they are its groundtruth. Of the others, which it is, the first line tells:
-    commas make a CSV file, whose first column is a stamp, and which a line of words may head.
+    From a JRL file, its groundtruth is read. The first line of other files shows their format:
+    with commas it is a CSV file, whose first column is a stamp, and which may have a header line.
 
-    by_stamps : let a graph file go by the stamps beside it, if any
+    by_stamps : use the stamps beside a graph file, if there are any, instead of its ids
 
     Raises
     ------
-    FileError : naming the line, when the file is none of them.
+    FileError : naming the line, if the file has none of these formats.
 
     """
     if Path(path).suffix.lower() in JRL_SUFFIXES:

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What the node says of itself on /diagnostics, once a second."""
+"""The diagnostics of the back end, published once a second."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
@@ -25,9 +25,9 @@ from l1slam_ros.ros.threads.solver_thread import SolverThread
 
 # [s], and the number of publications, which come once a second.
 _MINUTE = 60
-# [s] Loops may wait for so long to be judged.
+# [s] Loops that wait longer than this for their judgement are reported.
 _BEHIND = 10.0
-# Below this number of judged loops there is no warning when most are refused.
+# Least number of judged loops for the warning that most are rejected.
 _FEW = 5
 # [m], [rad] A map that moves the robot by less is not reported as a jump.
 _STILL = 1e-3
@@ -35,10 +35,10 @@ _STILL = 1e-3
 
 class RobotLine(NamedTuple):
     """
-    What there is to say of a robot.
+    The diagnostics of a robot.
 
-    robot : where it is, None: nothing has come; map_frame : returns that of its map by whether it
-    is joined to the first one
+    robot : its pose, None: no odometry yet; map_frame : returns the frame of its map, given
+    whether it is joined to the first robot
     """
 
     name: str
@@ -46,7 +46,7 @@ class RobotLine(NamedTuple):
     map_frame: Callable[[bool], str]
 
     def status(self, node: str, topics: Mapping[str, Traffic]) -> DiagnosticStatus:
-        """Return what is said of it by a node of some name; topics : see `Diagnostics`."""
+        """Return its status; node : name of the node; topics : see `Diagnostics`."""
         level, robot = DiagnosticStatus.OK, self.robot
         frame = self.map_frame(robot is not None and robot.joined)
         sentence = f'in {frame}'
@@ -59,9 +59,28 @@ class RobotLine(NamedTuple):
             name.removeprefix(f'{self.name}/') + f'.{key}': value
             for name, traffic in topics.items() if name.startswith(f'{self.name}/')
             for key, value in traffic.last.items()}
-        return DiagnosticStatus(
-            level=level, name=f'{node}: {self.name}', message=sentence, hardware_id=self.name,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+        return status_of(self.name, f'{node}: {self.name}', level, sentence, values)
+
+
+def traffic_values(topics: Mapping[str, Traffic]) -> dict[str, object]:
+    """Return the counts and rates of all topics, as `topic.value`."""
+    return {f'{topic}.{name}': value for topic, traffic in topics.items()
+            for name, value in traffic.values().items()}
+
+
+def status_of(hardware: str, name: str, level: bytes, sentence: str,
+              values: Mapping[str, object]) -> DiagnosticStatus:
+    """Return a status with values as text."""
+    return DiagnosticStatus(
+        level=level, name=name, message=sentence, hardware_id=hardware,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+
+
+def array_of(node: Node, statuses: list[DiagnosticStatus]) -> DiagnosticArray:
+    """Return a message of statuses, stamped with the time of a node."""
+    message = DiagnosticArray(status=statuses)
+    message.header.stamp = node.get_clock().now().to_msg()
+    return message
 
 
 class Diagnostics:
@@ -71,9 +90,9 @@ class Diagnostics:
     Parameters
     ----------
     node : whose name and clock it speaks with
-    topics : name -> how its messages come
-    solver : which may be compiling, or behind
-    failures : what fails now
+    topics : name -> the traffic on it
+    solver : its thread, which may be compiling, or behind
+    failures : the failures that last
 
     """
 
@@ -87,17 +106,17 @@ class Diagnostics:
         self._last: Improvement | None = None
         self._updates = 0
         self._jump: dict[str, str] = {}
-        # How many messages were refused, and how often the odometry broke off, by causes.
+        # Refused messages and jumps of the odometry, by causes.
         self._minute = deque([(Counter[str](), Counter[str]())], maxlen=_MINUTE)
 
     def note(self, improvement: Improvement) -> None:
-        """Remember the latest update; the solver's thread calls it."""
+        """Store the latest update."""
         self._last = improvement
         self._updates += 1
 
     def note_jump(self, manifold: Manifold, before: Array, after: Array, prefix: str) -> None:
         """
-        Remember how far a new map moved a robot: its pose (1, p) before [m] and after.
+        Store how far a new map moved a robot, from a pose (1, p) before to one after.
 
         prefix : of its names
         """
@@ -111,17 +130,14 @@ class Diagnostics:
         """
         Publish one status, and one of each robot.
 
-        counts : sizes of the graph; behind : what goes on behind updates; refused : cause -> how
-        many messages, since the start; told : how often the odometry did not go on as robots move,
-        by what was made of it; twins : what is wrong with the node's name, empty: nothing;
+        counts : sizes of the graph; behind : the background work; refused : cause -> number
+        of messages, since the start; told : cause -> number of jumps of the odometry;
+        twins : a sentence if the node's name is not unique, else empty;
         robots : those that have names.
         """
         lately, broken = refused - self._minute[0][0], told - self._minute[0][1]
         self._minute.append((Counter(refused), Counter(told)))
-        values: dict[str, object] = {
-            f'{topic}.{name}': value for topic, traffic in self._topics.items()
-            for name, value in traffic.values().items()}
-        values |= counts
+        values = traffic_values(self._topics) | dict(counts)
         values['updates'] = self._updates
         if self._last is not None:
             values |= {'l1_cost': f'{self._last.cost:.6g}', 'gap': f'{self._last.gap:.3g}',
@@ -137,21 +153,15 @@ class Diagnostics:
         values |= {f'odometry.{cause}': count for cause, count in sorted(told.items())}
         level, sentence = self._judgement(counts, lately, broken, twins)
         name = self._node.get_fully_qualified_name()
-        status = DiagnosticStatus(
-            level=level, name=f'{name}: map', message=sentence, hardware_id=name,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+        status = status_of(name, f'{name}: map', level, sentence, values)
         lines = [one.status(name, self._topics) for one in robots]
-        message = DiagnosticArray(status=[status, *lines])
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(message)
+        self._publisher.publish(array_of(self._node, [status, *lines]))
 
     def _judgement(self, counts: Mapping[str, int], lately: Counter[str], broken: Counter[str],
                    twins: str) -> tuple[bytes, str]:
-        """Return the level and all that is wrong now, in one sentence."""
-        failures = self._failures.lasting
-        if failures:
-            return DiagnosticStatus.ERROR, '; '.join(
-                f'{what} failed: {why}' for what, why in failures.items())
+        """Return the level, and a sentence with all that is wrong now."""
+        if failing := self._failures.sentence:
+            return DiagnosticStatus.ERROR, failing
         wrong = [twins] if twins else []
         for name, traffic in self._topics.items():
             if name.endswith('odom') and (sources := traffic.publishers()) > 1:

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-`backend`, `scan_loops`, `replay` and the demo: what comes before ROS is imported.
+The entry points `backend`, `scan_loops`, `replay` and the demo, before ROS is imported.
 
-What a node cannot be told, a middleware that is not there, and what is said where ROS itself,
-or anything else they need, is not there.
+They check the arguments and the middleware, and print one line if ROS or another library is
+missing.
 """
 
 import sys
@@ -28,7 +28,7 @@ _BAD_INPUT = 2
 
 
 def backend() -> int:
-    """Run the back end; return the exit code: 2 where it is told what it does not know."""
+    """Run the back end; return the exit code: 2 for an unknown argument."""
     def options() -> Options:
         from l1slam_ros.io.node_options import NodeOptions
 
@@ -38,7 +38,7 @@ def backend() -> int:
 
 
 def scan_loops() -> int:
-    """Run the scan front end; return the exit code: 2 where it is told what it does not know."""
+    """Run the scan front end; return the exit code: 2 for an unknown argument."""
     def options() -> Options:
         from l1slam_ros.ros.scans.options import ScanLoopsOptions
 
@@ -58,10 +58,10 @@ def demo() -> int:
 
 
 def _run_node(name: str, module: str, options: Callable[[], Options]) -> int:
-    """Run a node that has no arguments of its own but for --help, which tells its options."""
+    """Run a node, whose only argument besides those of ROS is --help."""
     own, _ = split(sys.argv[1:])
     if '-h' in own or '--help' in own:
-        with suppress(BrokenPipeError):  # who reads may have seen enough
+        with suppress(BrokenPipeError):  # the reader may have closed the pipe
             print(help_of(name, options()))
         leave(0)
     if own:

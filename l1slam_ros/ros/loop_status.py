@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What has become of each loop, on `loop_status`: a status when one comes, and on each change."""
+"""Publishing the state of each loop on `loop_status`, when it comes and at each change."""
 
 import struct
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from l1slam_ros.core.running.snapshot import ACCEPTED, EXPIRED, LOOP_STATES, WAI
 from l1slam_ros.io.files import stamp_text
 from l1slam_ros.io.messages.serialisation import cdr, header_bytes, string_bytes
 
-# A late subscriber still gets the last changes.
+# Number of messages that a late subscriber still receives.
 _DEPTH = 1000
 
 
@@ -31,8 +31,8 @@ class LoopStatus:
 
     Parameters
     ----------
-    node : whose name and clock it speaks with
-    robots : their names by their numbers, none: there is one without a name
+    node : to publish with
+    robots : names by number; empty for a single robot without a name
 
     """
 
@@ -47,7 +47,7 @@ class LoopStatus:
         self._waiting: set[tuple[int, ...]] = set()
 
     def publish(self, states: LoopStates) -> None:
-        """Publish the loops whose state has changed since the last call; called by the worker."""
+        """Publish the loops whose state has changed since the last call."""
         known, count = len(self._in_graph), len(states.rows)
         if count < known:  # the map began anew
             known = 0

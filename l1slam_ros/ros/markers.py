@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The graph as RViz and Foxglove draw it: keyframes as points, factors as lines.
+Publishing the graph for RViz and Foxglove: keyframes as points, factors as lines.
 
-Each namespace is drawn in pieces, a marker each, and only the pieces that changed are sent: most
-of a large map stands still. They are made as bytes, of arrays, see `serialisation.path_bytes`.
+Each namespace is split into markers, and only those that changed are sent, because most of a large
+map does not change. They are serialised from arrays, see `serialisation.path_bytes`.
 """
 
 import struct
@@ -29,18 +29,18 @@ from l1slam_ros.core.graph.factor_graph import WORLD
 from l1slam_ros.core.running.snapshot import ACCEPTED, REJECTED, SUSPECT, Snapshot
 from l1slam_ros.io.messages.serialisation import cdr, header_bytes, string_bytes
 
-# As in the pictures: Okabe and Ito's, and a redder red.
+# The colours of the pictures, by Okabe and Ito, with a redder red.
 _BLUE, _GREY = (0.0, 0.447, 0.698), (0.5, 0.5, 0.5)
-# Loops: from green over yellow to red as their residual grows to so many sigmas.
+# Loops turn from green over yellow to red as their residual grows to these sigmas.
 _SIGMAS = (0.0, 2.5, 5.0)
 _WORST = 5.0
 _LADDER = np.array([(0.0, 0.62, 0.451), (0.902, 0.624, 0.0), (0.835, 0.216, 0.055)])
 _LOOPS = {'loops': ACCEPTED, 'suspect_loops': SUSPECT, 'rejected_loops': REJECTED}
 _POINT, _LINE = 0.12, 0.05  # [m]
-# Keyframes or factors of one marker; what moves by less [m] is not sent again.
+# Number of keyframes or factors of a marker; and the motion [m] below which it is not sent again.
 _PIECE = 500
 _STILL = 0.01
-_EVERY = 1.0  # [s] shortest time between two publications: people see no faster
+_EVERY = 1.0  # [s] shortest time between two publications
 # Lifetime: for ever; not locked to the frame.
 _FOR_EVER = struct.pack('<iI?', 0, 0, False)
 # No texture, its header and format, coordinates on it, text, mesh, its file; no materials.
@@ -72,11 +72,11 @@ class GraphMarkers:
 
     @property
     def behind(self) -> bool:
-        """Whether there is a subscriber that has not been sent the last map."""
+        """Whether a subscriber has not received the last map yet."""
         return self._someone_new or (self._waits and time.monotonic() - self._last >= _EVERY)
 
     def publish(self, frame: str, stamp: int, now: Snapshot) -> None:
-        """Publish what has changed since the last call; the solver's thread calls it."""
+        """Publish what has changed since the last call; called by one thread at a time."""
         if not self._publisher.get_subscription_count():
             return
         if not self._someone_new and time.monotonic() - self._last < _EVERY:
@@ -129,7 +129,7 @@ def _namespaces(now: Snapshot) -> Iterator[tuple[str, int, float, Array, np.ndar
 
 
 def _colours(rgb: Any, count: int) -> np.ndarray:
-    """Return opaque colours to two digits, (count, 4)."""
+    """Return opaque colours, rounded to two digits, (count, 4)."""
     colours = np.ones((count, 4), np.float32)
     colours[:, :3] = np.round(rgb, 2)
     return colours

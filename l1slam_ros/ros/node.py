@@ -7,11 +7,11 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-`backend`: the node. Odometry and loop closures in, the optimised Path out; no arithmetic.
+The node `backend`: odometry and loop closures in, the optimised Path out.
 
-One thread takes messages in and answers with poses, one improves the map and publishes it, one
-carries out what services ask for, and saves. See `core.running.backend` for why none waits for the
-other.
+One thread receives messages and publishes poses, one improves and publishes the map, one carries
+out services, and one saves the map. None waits for another that computes, see
+doc/how_a_message_becomes_a_map.md.
 """
 
 import time
@@ -42,16 +42,16 @@ from l1slam_ros.ros.threads.job_queue import JobQueue
 from l1slam_ros.ros.threads.solver_thread import SolverThread
 
 _REPEAT_WARNING = 5.0  # [s]
-# [s] The end of the node waits so much longer for a map that is being saved.
+# [s] By how much longer the node waits at its end for a map that is being saved.
 _SAVING = 4.0
 
 
 class BackendNode(LifecycleNode):
     """
-    The ROS face of `core.running.backend.Backend`.
+    The ROS node around `core.running.backend.Backend`.
 
-    A managed node: messages are used, and map -> odom is published, while it is active, which it
-    is at once unless `autostart` is off. To clean it up empties the map.
+    A managed node: it uses messages and publishes map -> odom while it is active, which it is at
+    once unless `autostart` is false. The transition `cleanup` empties the map.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class BackendNode(LifecycleNode):
 
     Attributes
     ----------
-    failures : what fails now
+    failures : the failures that last
 
     Raises
     ------
@@ -97,7 +97,7 @@ class BackendNode(LifecycleNode):
         if options.autostart:
             self.trigger_configure()
             self.trigger_activate()
-        # Active first: who hears of a loaded map may send odometry at once.
+        # Activate first: a subscriber that receives a loaded map may send odometry at once.
         self._map.tell()
         self._jobs.start()
         self._map_services.start()
@@ -105,7 +105,7 @@ class BackendNode(LifecycleNode):
         self._inputs.intake.start()
 
     def _connect_callbacks(self) -> None:
-        """Hear of new parameters and transitions, of jumps of the clock, and of each second."""
+        """Register the callbacks of parameters, transitions, clock jumps and the timer."""
         guarded = self.failures.guarded
         self.add_on_set_parameters_callback(self._on_set)
         change = self._service_change_state
@@ -114,7 +114,7 @@ class BackendNode(LifecycleNode):
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=False),
             post_callback=guarded('time jump', self._on_time_jump))
-        # By a clock that goes on where simulated time stands still, or a bag has ended.
+        # A steady clock, which also runs when simulated time stands still or a bag has ended.
         self.create_timer(1.0, guarded('diagnostics', self._on_second),
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -125,7 +125,7 @@ class BackendNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Leave messages alone, and the map as it is."""
+        """Ignore messages from now on; the map stays as it is."""
         self._inputs.intake.active = False
         return TransitionCallbackReturn.SUCCESS
 
@@ -135,11 +135,11 @@ class BackendNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Leave messages alone for good; the map is saved when the process ends."""
+        """Ignore messages for good; the map is saved when the process ends."""
         return self.on_deactivate(state)
 
     def _on_change_state(self, change: Any, request: Any, response: Any) -> Any:
-        """Answer also where there is no such transition: rclpy would raise."""
+        """Answer a request for a transition that does not exist, for which rclpy raises."""
         try:
             return change(request, response)
         except rclpy_implementation.RCLError:
@@ -151,7 +151,7 @@ class BackendNode(LifecycleNode):
 
     @property
     def options(self) -> NodeOptions:
-        """The options as they are now."""
+        """The current options."""
         return self._declared.options
 
     def close(self, seconds: float = 60.0) -> bool:
@@ -166,7 +166,7 @@ class BackendNode(LifecycleNode):
         ended &= self._map.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
-            # It holds the node in the graph of ROS, and rclpy forgets it.
+            # rclpy does not destroy it, and it keeps the node in the graph of ROS.
             self._state_machine: Any = None
         return ended
 
@@ -175,7 +175,7 @@ class BackendNode(LifecycleNode):
         return self._map_services.is_saving()
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse a file that cannot be; at start its folder may be mounted later."""
+        """Refuse a `save_path` that cannot be written; at start its folder may be missing."""
         wrong = ''.join(unusable_path(str(parameter.value)) for parameter in parameters
                         if parameter.name == 'save_path')
         return SetParametersResult(successful=not wrong, reason=wrong)
@@ -198,12 +198,12 @@ class BackendNode(LifecycleNode):
             self._twins(), self._lines())
 
     def _lines(self) -> list[RobotLine]:
-        """Return what is said of each robot that has a name."""
+        """Return the diagnostics of each robot that has a name."""
         return [RobotLine(one.name, self._backend.robot(one.number), one.map_frame)
                 for one in self._robots if one.name]
 
     def _twins(self) -> str:
-        """Return what is wrong where another node has this one's name; else nothing."""
+        """Return a sentence if another node has the same name, else an empty one."""
         own = self.get_name(), self.get_namespace()
         count = self.get_node_names_and_namespaces().count(own)
         if count < 2:

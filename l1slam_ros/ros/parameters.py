@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Options <-> ROS parameters: one is declared nowhere but at its field."""
+"""Declaring options as ROS parameters; name, default, unit and range come from the fields."""
 
 from collections.abc import Callable
 from difflib import get_close_matches
@@ -28,12 +28,12 @@ from l1slam_ros.core.options import AnyOptions, Meaning, Scalar, flatten, with_v
 
 class NodeParameters(Generic[AnyOptions]):
     """
-    The parameters of a node, as one options record that follows every change.
+    The parameters of a node, as an options record that is replaced at every change.
 
     Parameters
     ----------
     node : where to declare them
-    defaults : what there is to declare
+    defaults : the options to declare, at their defaults
     on_change : called with the new options after each accepted change
 
     Raises
@@ -57,7 +57,7 @@ class NodeParameters(Generic[AnyOptions]):
         node.add_post_set_parameters_callback(self._apply)
 
     def unknown(self) -> list[str]:
-        """Return a sentence for each parameter given at start that the node does not have."""
+        """Return a sentence for each unknown parameter that was given at start."""
         overrides, known = self._node._parameter_overrides, self._node._parameters
         sentences = []
         for name in sorted(overrides.keys() - known.keys()):

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The map on its topics, as often as there is something new in it.
+Publishing the map whenever it has changed.
 
-All keyframes of a large map take longer to be worked out and sent than an update takes. They are
-sent by a thread of their own then, for a part of its time; what came meanwhile is in the next.
+To compute and send all keyframes of a large map takes longer than an update. A thread of its own
+does that then, with pauses, and sends the newest map each time.
 """
 
 import threading
@@ -38,8 +38,8 @@ from l1slam_ros.ros.robot import RobotPublisher
 from l1slam_ros.ros.threads.background import background
 from l1slam_ros.ros.threads.failures import Failures
 
-# Keyframes from which a map is large: some 10 ms to publish. The thread that does it rests for so
-# many times as long as it worked.
+# Number of keyframes from which a map is large: some 10 ms to publish. Its thread rests for
+# this many times as long as it works.
 _LARGE, _REST = 10_000, 3
 
 
@@ -52,9 +52,9 @@ class MapPublisher:
     node : to publish from
     backend : whose map
     parameters : of the node
-    diagnostics : told of updates, and of how far they moved the robots
-    robots : each has a path of its own
-    failures : where to tell what the thread of a large map meets
+    diagnostics : gets the updates, and the jumps of the robots
+    robots : each with a path of its own
+    failures : records errors of the thread for large maps
 
     """
 
@@ -81,7 +81,7 @@ class MapPublisher:
 
     def tell(self, improvement: Improvement | None = None) -> None:
         """
-        Publish what is new; improvement : what the last update did, None: nothing.
+        Publish what is new; improvement : the result of the last update, or None.
 
         A large map is published soon, by another thread.
         """
@@ -96,7 +96,7 @@ class MapPublisher:
             self._woken.set()
 
     def close(self, seconds: float) -> bool:
-        """End the thread, if there is one; return whether it did within some seconds."""
+        """End the thread, if there is one; return whether it ended within `seconds`."""
         self._ending.set()
         self._woken.set()
         if self._thread is not None:
@@ -107,19 +107,19 @@ class MapPublisher:
         publish = self._failures.guarded('publishing', self._publish_news)
         while not self._ending.is_set():
             self._woken.wait()
-            # In this order, or news would be lost.
+            # Before publishing, or a change during that would be lost.
             self._woken.clear()
             began = time.monotonic()
             publish()
             self._ending.wait(_REST * (time.monotonic() - began))
 
     def _publish_news(self) -> None:
-        with self._one:  # of the last call of an update, and the first of the thread
+        with self._one:  # the last call by an update and the first by the thread may overlap
             revisions = self._backend.revisions
             if revisions.map > self._published:
                 self._publish_map()
             elif revisions.now > self._published:
-                # Nothing new in the map, but a loop can have come for later, or expired.
+                # The map is the same, but a loop may be waiting or have expired.
                 self._loop_status.publish(self._backend.loop_states())
             elif self._markers.behind:
                 self._markers.publish(self._frame, self._newest(), self._backend.snapshot())
@@ -140,7 +140,7 @@ class MapPublisher:
 
     def _publish_robot(self, now: Snapshot, one: RobotPublisher, path: Publisher,
                        covariance: Publisher) -> None:
-        """Publish the path of a robot; without a name it has all keyframes there are."""
+        """Publish the path of a robot; a robot without a name has all keyframes."""
         manifold = self._backend.manifold
         robot = self._backend.robot(one.number)
         if robot is not None:
@@ -160,10 +160,10 @@ class MapPublisher:
         stamp = robot.stamp if robot is not None else 0
         path.publish(path_bytes(frame, stamp, stamps, manifold.to_pose3(poses)))
         if covariance.get_subscription_count() and len(poses):
-            # A map of its own is held by the first keyframe of the robot.
+            # The map of an unjoined robot is fixed at the robot's first keyframe.
             known = self._backend.marginal_covariance(
                 int(keyframes[-1]), None if joined else int(keyframes[0]))
-            # None: a later map knows it, if any.
+            # None: this map does not have it.
             if known is not None:
                 covariance.publish(pose_with_covariance(
                     frame, int(stamps[-1]), manifold, poses[-1:], known))
@@ -177,10 +177,10 @@ class MapPublisher:
 def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array,
                          covariance: Array) -> bytes:
     """
-    Return a serialised PoseWithCovarianceStamped: a pose (1, p), and how well it is known.
+    Return a serialised PoseWithCovarianceStamped of a pose (1, p).
 
-    covariance : (d, d) in the axes of the pose, where ROS has those of the frame; what the
-    manifold has no components for is known
+    covariance : (d, d) in the axes of the pose; it is converted to the axes of the frame, as in
+    ROS; components that the manifold does not have are zero
     """
     pose3 = manifold.to_pose3(pose)
     turn = pose3 * [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]

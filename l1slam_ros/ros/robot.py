@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Where the robot is: as map -> odom and on `pose`, with its odometry; the former on a clock, too.
+Publishing the pose of a robot at the rate of its odometry, and map -> odom, by a timer, too.
 
-The transform is on `map_to_odom` always, on /tf where tf2_msgs is installed.
+The transform is published on `map_to_odom`, and on /tf if tf2_msgs is installed.
 """
 
 import math
@@ -32,25 +32,25 @@ except ImportError:  # the ROS wheels on PyPI have none
     TFMessage = None
 
 _LATELY = 20
-# [ns] Taken for the time to the second message of the odometry; seldom is it more.
+# [ns] Assumed period of the odometry before its second message.
 _FIRST_GUESS = NANOSECONDS // 5
-# The next message may come later than lately, by so much of that time [1].
+# The next message may come later than the usual period, by this factor [1].
 _SPARE = 1.5
-# [ns] Odometry that comes more seldom than every 1.3 s is covered by the tolerance alone: until
-# the newest stamp that is out, what a look-up finds lies between an old transform and the new one.
+# [ns] Longest time by which the period of the odometry extends the stamps. For odometry with a
+# longer period, look-ups would otherwise interpolate far between an old and a new transform.
 _FURTHEST = 2 * NANOSECONDS
-# A transform goes out with odometry unless one that is out reaches nearly as far [1].
+# A transform is published with odometry unless the last one reaches nearly as far [1].
 _NEARLY = 0.9
 
 
 class Horizon:
     """
-    How far ahead of the newest odometry a transform is to be stamped.
+    Decides how far ahead of the newest odometry a transform is stamped.
 
-    Who hears of a message of the odometry looks up its stamp at once, when the transform that this
-    message will cause is still to come. So the one before must reach to it: as far as from one
-    message to the next. That time is the longest but one of the last twenty, for odometry may have
-    stopped once, and half of it again.
+    A node that receives odometry looks up its stamp at once, before the transform caused by this
+    message is published. So the previous transform must reach that stamp, one odometry period
+    ahead. That period is the longest but one of the last twenty, as the odometry may have paused
+    once, and a half of it is added.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Horizon:
         self._newest = 0
 
     def note(self, stamp: int) -> None:
-        """Note the stamp of odometry that has come [ns]; one that is older begins anew."""
+        """Add the stamp of an odometry message [ns]; an older stamp begins anew."""
         if stamp < self._newest:
             self._intervals = deque([_FIRST_GUESS], _LATELY)
         elif 0 < self._newest < stamp:
@@ -66,23 +66,23 @@ class Horizon:
         self._newest = stamp
 
     def ahead(self, tolerance: float) -> int:
-        """Return how far [ns], `tolerance` [s] at least."""
+        """Return how far to stamp ahead [ns]; at least `tolerance` [s]."""
         usual = sorted(self._intervals)[-2:][0]
         return max(int(tolerance * NANOSECONDS), min(int(_SPARE * usual), _FURTHEST))
 
 
 class RobotPublisher:
     """
-    Publishes the robot in the map, and where the odometry frame is there.
+    Publishes the pose of a robot in the map, and map -> odom.
 
     The transform is stamped ahead of the newest odometry, see `Horizon`.
 
     Parameters
     ----------
     node : to publish from
-    backend : which knows where the robot is
-    parameters : of the node, with the options as they are now
-    number, name : of the robot; its topics and frames are below its name, empty: it has none
+    backend : which has the pose of the robot
+    parameters : of the node, with the current options
+    number, name : of the robot; its topics and frames begin with the name, if that is not empty
 
     """
 
@@ -106,7 +106,7 @@ class RobotPublisher:
 
     @property
     def prefix(self) -> str:
-        """What the names of its topics and frames begin with."""
+        """The prefix of its topics and frames."""
         return f'{self.name}/' if self.name else ''
 
     @property
@@ -115,20 +115,20 @@ class RobotPublisher:
         return f'{self.prefix}{self._parameters.options.odom_frame}'
 
     def map_frame(self, joined: bool) -> str:
-        """Return the frame of its map, joined : which is that of the first robot."""
+        """Return the frame of its map; joined : its map is that of the first robot."""
         own = '' if joined else self.prefix
         return f'{own}{self._parameters.options.map_frame}'
 
     def answer(self) -> None:
         """
-        Publish where the robot is now.
+        Publish the pose of the robot, and the transform if it is due.
 
-        First the transform: who has heard of this odometry, too, is about to look it up, and what
-        comes next is to find this one there.
+        The transform comes first: other nodes that received this odometry are about to look
+        it up.
         """
         robot = self._look()
         manifold = self._backend.manifold
-        if robot is None:  # the map has been emptied meanwhile
+        if robot is None:  # the map was emptied meanwhile
             return
         if robot.stamp != self._before and self._stamp < robot.stamp + _NEARLY * self._ahead():
             self._publish(robot)
@@ -137,14 +137,14 @@ class RobotPublisher:
             self.map_frame(robot.joined), robot.stamp, manifold.to_pose3(pose)[0]))
 
     def forget(self) -> None:
-        """Publish no transform until there is other odometry: its stamps are of another time."""
+        """Publish no transform until odometry with another stamp comes: time has jumped."""
         self._before = self._newest
 
     def tick(self) -> float:
         """
-        Publish the transform if it is time; return when to call again [s], or infinity.
+        Publish the transform if it is due; return the time until it is due again [s], or inf.
 
-        It is time, too, when odometry that nobody answered is newer than the last transform.
+        It is also due if odometry is newer than the stamp of the last transform.
         """
         robot, now = self._look(), time.monotonic()
         if robot is None or robot.stamp == self._before:
@@ -166,13 +166,13 @@ class RobotPublisher:
         return self._horizon.ahead(self._parameters.options.transform_tolerance)
 
     def _publish(self, robot: Robot) -> None:
-        """Publish the transform as it is now."""
+        """Publish the current transform."""
         self._before = 0
         if robot.map_to_odom is not self._last[0]:
             self._last = (robot.map_to_odom,
                           self._backend.manifold.to_pose3(robot.map_to_odom)[0])
         if not self._stamp:
-            # Before the first there is nothing to look up.
+            # The first one is also published at the stamp of the odometry itself.
             self._stamp = robot.stamp
             self._send(robot)
         # tf2 ignores a second transform of one time, and warns of it.

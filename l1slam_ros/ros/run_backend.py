@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The process of a node: SIGINT, SIGTERM and SIGHUP end it within two seconds, whatever it does.
+Running a node as a process, which SIGINT, SIGTERM and SIGHUP end within two seconds.
 
-It is imported and run before anything heavy, so that signals work while the rest is imported, too.
+This module is imported before all slow modules, so that signals work during their import, too.
 """
 
 import os
@@ -22,19 +22,19 @@ from contextlib import suppress
 from typing import Any
 
 _BAD_INPUT = 2
-# [s] A signal leaves that long for an orderly end; the threads of the node get a part of it.
+# [s] Time for an orderly end after a signal, and the part of it for the threads of the node.
 _PATIENCE, _THREADS = 1.2, 0.9
-# [s] And so much longer for a map that is being saved.
+# [s] Additional time if a map is being saved.
 _SAVING = 4.5
-# [s] Pause after an error, so that one which recurs does not keep a core busy.
+# [s] Pause after an error, so that a recurring one does not keep a core busy.
 _BREATH = 0.05
-# [s] How long the interpreter lets the solver's own Python run before a callback may.
+# [s] Switch interval of the interpreter: the longest time for which solver code delays a callback.
 _TURN = 5e-4
 
 
 class Signals:
     """
-    Waits for a signal in a thread of its own: no other thread need be where it can take one.
+    Waits for signals in a thread of its own, so that no other thread has to handle them.
 
     Attributes
     ----------
@@ -51,13 +51,13 @@ class Signals:
         os.set_blocking(write, False)
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
         for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
-            # The terminal may go, unless `nohup` says that this is nothing to the node.
+            # SIGHUP is left ignored under `nohup`.
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, lambda *_: None)
         threading.Thread(target=self._wait, name='signals', daemon=True).start()
 
     def orderly(self, wake: Callable[[], None]) -> None:
-        """From now on a signal calls `wake`, which is to make the main thread end all."""
+        """From now on a signal calls `wake`, which makes the main thread end the node."""
         self._wake = wake
         if self.begun:
             wake()
@@ -79,7 +79,7 @@ class Signals:
 def leave(code: int) -> None:
     """End the process now, whatever its threads are doing."""
     for stream in (sys.stdout, sys.stderr):
-        # Nobody may be listening any more, or ever have been: then it is None.
+        # The stream may be closed, or None if it never was open.
         with suppress(OSError, ValueError, AttributeError):
             stream.flush()
     os._exit(code)
@@ -101,9 +101,9 @@ def run(name: str, load: Callable[[], Any], ready: str) -> None:
 
     Parameters
     ----------
-    name : what it is called where it cannot begin
-    load : imports what makes it, and returns that
-    ready : what it says once it is there
+    name : of the executable, for errors
+    load : imports the class of the node, and returns it
+    ready : the message of the log when it is ready
 
     """
     signals = Signals()
@@ -136,17 +136,17 @@ def run(name: str, load: Callable[[], Any], ready: str) -> None:
         print(f'{name}: {error}', file=sys.stderr)
         code = 1
     except Exception:
-        # A signal can shut ROS down under any call; what that call then raises is no failure.
+        # A signal can shut ROS down during any call; the error of that call is not a failure.
         if rclpy.ok():
             raise
     if node is None or node.close(_THREADS):
         rclpy.try_shutdown()
-    # Not by returning: a thread that is within ROS when the interpreter is torn down aborts.
+    # Not by returning: a thread inside ROS would abort while the interpreter is torn down.
     leave(code)
 
 
 def _spin(executor: Any, node: Any) -> None:
-    """Serve callbacks until ROS is shut down, whatever ROS itself raises meanwhile."""
+    """Serve callbacks until ROS is shut down, and log errors that ROS raises meanwhile."""
     import rclpy
     from rclpy.executors import ExternalShutdownException
 

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The services of the node, what the thread of the jobs does for each, and a thread that saves.
+The services of the node, which a thread of jobs carries out, and the thread that saves the map.
 
-That one has no more to wait for than a moment in which nothing is appended: neither for what
-services ask for nor for the solver, and it makes way for neither.
+The thread that saves waits only for a moment in which no factor is appended, not for services or
+for the solver.
 """
 
 import threading
@@ -43,11 +43,11 @@ class MapServices:
     Parameters
     ----------
     node : to create them on
-    backend : what they act on
+    backend : the map that they act on
     jobs : where they queue their work
     map_file : of `~/save` and `~/load`
-    failures : where to tell what nobody asked for
-    pause : called, at once, with whether updates shall pause
+    failures : records failures of autosaves
+    pause : called at once with whether updates are to pause
     stopped : asked whether the node is ending
 
     """
@@ -62,7 +62,7 @@ class MapServices:
         self._stopped = stopped
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._keep_saving, name='autosave', daemon=True)
-        # A group of their own: a service that awaits its answer would block its whole group.
+        # A callback group of their own: a service that awaits its result blocks its group.
         group = ReentrantCallbackGroup()
         for name, work in (('optimize', self._optimise), ('reset', self._reset),
                            ('save', map_file.save), ('load', map_file.load)):
@@ -103,7 +103,7 @@ class MapServices:
             *offset_sentence(graph.manifold, offset)])
 
     def _settled(self) -> tuple[Improvement | None, Snapshot]:
-        """Return what solving the map to the end did, and it; others may take its place."""
+        """Solve to the optimum, again if the map is replaced; return the result and a snapshot."""
         while True:
             try:
                 improvement = self._backend.settle(self._stopped)
@@ -120,11 +120,11 @@ class MapServices:
         return 'the map is empty'
 
     def begin_anew(self, why: str) -> None:
-        """Let the map be emptied, which nobody asked for: what is new in it is saved."""
+        """Save the map, then empty it: for a reason other than `~/reset`."""
         self._jobs.put(why, lambda: self._autosave(self._backend.reset))
 
     def start(self) -> None:
-        """Begin to save the map whenever it is time."""
+        """Start the thread that saves the map periodically."""
         self._thread.start()
 
     def close(self) -> None:
@@ -132,12 +132,12 @@ class MapServices:
         self._ending.set()
 
     def is_closed(self, seconds: float) -> bool:
-        """Return whether that is done within some seconds."""
+        """Return whether that is done within `seconds`."""
         self._thread.join(seconds)
         return not self._thread.is_alive()
 
     def is_saving(self) -> bool:
-        """Return whether the map is being saved, or will be at once."""
+        """Return whether the map is being saved, or is about to be."""
         return self._map_file.is_saving or (self._ending.is_set() and self._thread.is_alive())
 
     def _keep_saving(self) -> None:
@@ -145,7 +145,7 @@ class MapServices:
         while not self._ending.wait(_LOOK):
             if self._map_file.is_due() and (began := time.monotonic()) >= again:
                 self._autosave()
-                again = 2 * time.monotonic() - began  # no more than half of the time
+                again = 2 * time.monotonic() - began  # at most half of the time is spent saving
         self._autosave()
 
     def _autosave(self, taken: Callable[[], None] = lambda: None) -> str:

@@ -121,7 +121,7 @@ def test_one_place_that_alone_joins_is_doubted(world, tmp_path, capsys):
     loops = listed(tmp_path, [line for line, is_near in zip(between, one, strict=True) if is_near])
     found, said = merge_json(capsys, *paths, '--loops', loops, '--output', tmp_path / 'out.g2o',
                              code=4)
-    assert found['doubts'][0]['kind'] and 'only loops of one place agree' in said
+    assert found['doubts'][0]['kind'] and 'joined only by loops of one place' in said
 
 
 def test_a_bag_and_a_graph_are_merged(world, tmp_path, capsys):
@@ -163,7 +163,7 @@ def test_what_cannot_be_merged_is_refused(world, tmp_path, capsys):
     assert 'vertex 5000 is of no input' in said and f'{second}:' in said
     (tmp_path / 'out.g2o').write_text('of others\n')
     assert 'not overwritten' in run(capsys, 'merge', first, world, *output, code=2)[1]
-    assert 'is read' in run(capsys, 'merge', first, world, '--output', first, code=2)[1]
+    assert 'is an input' in run(capsys, 'merge', first, world, '--output', first, code=2)[1]
 
 
 def test_an_edge_that_two_others_could_mean_is_refused(world, tmp_path, capsys):

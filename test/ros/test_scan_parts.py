@@ -193,7 +193,7 @@ def test_static_transforms_say_where_the_laser_is():
     np.testing.assert_allclose((mount.x, mount.y, mount.yaw), (0.1, 0.5, np.pi / 2))
     assert mount.upside_down
     assert static.mount('base', 'sonar') is None and static.mount('base', 'base') == Mount()
-    with pytest.raises(MessageError, match='looks along the floor'):
+    with pytest.raises(MessageError, match='scans parallel to the floor'):
         static.mount('base', 'camera')
     circle = StaticTransforms()
     circle.add(SimpleNamespace(transforms=[transform('a', 'b', (0, 0, 0, 0, 0, 0, 1)),

@@ -7,17 +7,17 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What comes after a factorisation: covariances, and a small dense factor that grows.
+A sparse factorisation bordered by later factors: covariances, and a dense factor that grows.
 
-The arrays of the sparse factor are those of `cholesky`. L^-1 e_p, the k columns of one keyframe p,
-is zero but on the way from p to the root of the elimination tree. The covariance of two keyframes
-is the product of their columns on what their ways have in common, which is the end of both. Where
-columns are too long to be kept, as in a chain, H^-1 e_p is solved for on the ways of those.
+The arrays of the sparse factor are those of `cholesky`. L^-1 e_p for the k columns of one keyframe
+p is zero except on the path from p to the root of the elimination tree. The covariance of two
+keyframes is the product of their columns on the part that both paths share, which is the end of
+both. If columns are too long to be kept, as in a chain, H^-1 e_p is solved for on the paths.
 
-Points are the keyframes that factors touch. Those that came later have no position in the factor;
-where they are hangs on another point, their parent: x = turn x_parent + noise. Triangles are kept
-row after row, row r from r (r + 1) / 2 on, so that they grow at their end: that of the factor F,
-and the covariances of points, that of s <= t at t (t + 1) / 2 + s.
+Points are the keyframes of later factors. Points newer than the factorisation have no position in
+the factor; they depend on another point, their parent: x = turn x_parent + noise. Triangular
+matrices are stored row by row, row r from r (r + 1) / 2 on, so that they grow at their end: the
+factor F, and the covariances of points, that of s <= t at t (t + 1) / 2 + s.
 """
 
 import numpy as np

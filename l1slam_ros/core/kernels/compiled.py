@@ -9,13 +9,13 @@
 """
 The decorators of every compiled loop.
 
-A loop is compiled once per machine: its machine code is kept, and called without numba if the
-arguments are of types that it was compiled for ahead (see `kept`). Else, and where nothing could
-be kept, numba has the call: it keeps its results beside the package, or where that is read-only
-in the user's cache folder. Reading one of these back takes some 4 ms, however small it is, so
-loops that follow each other are one loop.
+A loop is compiled once per machine. Its machine code is kept (see `kept`), and called without
+numba if the arguments have types for which it was compiled ahead. Otherwise, or if nothing could
+be kept, numba makes the call; its cache is beside the package, or in the user's cache folder if
+that is read-only. To read a loop from that cache takes some 4 ms, however small it is, so loops
+that follow each other are written as one loop.
 
-A loop may call only functions of its own module: of others neither would see that they changed.
+A loop may call only functions of its own module: neither cache notices changes in other modules.
 """
 
 from collections.abc import Callable

@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Many steps of all keyframes at once, and what they say of each factor.
+Sampled steps of all keyframes at once, and the innovations of factors that they predict.
 
 Arrays of steps are (n, k, q): q = `SAMPLES` of the k numbers of each of n keyframes, the last
 keyframe standing for all that are held fixed; k is 3 or 6, and the work is done in tiles of 3 x 3.

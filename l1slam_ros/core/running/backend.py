@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The running back end: samples and loops in, optimised poses out, from many threads.
+The running back end: odometry and loops in, optimised poses out; any thread may call it.
 
-It has a keeper, which owns the graph and its map, and updates of that; see `keeper`.
+It consists of a keeper, which owns the graph and its map, and `Updates` of that map.
 """
 
 import os
@@ -49,15 +49,15 @@ from l1slam_ros.core.running.snapshot import (
 )
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
-# The manifold of the poses, by the dimension of the world.
+# Dimension of the world -> the manifold of the poses.
 _MANIFOLDS: dict[int, Manifold] = {2: se2, 3: se3}
-# [s] With `background=True`: the back end is idle when nothing has come for so long.
+# [s] With `background=True`: the time without new data after which the back end is idle.
 _PAUSE = 0.2
 
 
 @dataclass(frozen=True)
 class RobustOptions(Options):
-    """Whether loops are doubted."""
+    """Whether loops are judged."""
 
     enabled: bool = option(
         True, 'use a loop only once other loops or the odometry confirm it; false: use every '
@@ -76,7 +76,7 @@ class BackendOptions(GraphBuilderOptions):
 
 class Backend:
     """
-    Keeps a map while it grows.
+    Makes a map from odometry and loops while they come.
 
     Parameters
     ----------
@@ -87,10 +87,10 @@ class Backend:
 
     Attributes
     ----------
-    manifold : what the poses live on
+    manifold : the manifold of the poses
     options : as they are now
-    base_frame, base_frame_of : of the first robot, and of one by its number, as far as they are
-        known; no reset forgets them
+    base_frame, base_frame_of : the name of the first robot's frame, and of that of a robot by its
+        number, as far as they are known; a reset keeps them
     calm : background work pauses inside `with backend.calm:`
 
     Raises
@@ -160,9 +160,9 @@ class Backend:
 
     def set_options(self, options: BackendOptions) -> None:
         """
-        Work by other options from now on; what is in the graph stays.
+        Use other options from now on; the graph stays as it is.
 
-        Where loops are to be doubted that were not before, or the other way round, all are judged
+        If loops are to be judged that were not before, or the other way round, all are judged
         anew.
         """
         _require_options(options)
@@ -171,19 +171,19 @@ class Backend:
         self._wake()
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Begin with an empty graph."""
         self._keeper.begin(_builder(self))
         self._wake()
 
     def saved(self) -> SavedMap | None:
-        """Return all that another back end goes on from; None: there are no factors yet."""
+        """Return the state from which another back end can continue; None without factors."""
         return self._keeper.saved()
 
     def restore(self, saved: SavedMap) -> int:
         """
-        Go on from what another back end has `saved`, in the place of the map there is.
+        Continue from the state that another back end has `saved`, in place of the present map.
 
-        Return what names its graph in this one, see `SavedMap`.
+        Return the number of its graph in this back end, see `SavedMap`.
         """
         found, robust = saved.builder.graph.manifold, self.options.robust.enabled
         if found is not self.manifold:
@@ -202,7 +202,7 @@ class Backend:
     def update(self, budget: float = 0.1, stopped: Stopped = lambda: False,
                taken: Callable[[], None] = lambda: None) -> Improvement | None:
         """
-        Take new factors into the map and start background work; None: there was nothing to do.
+        Put new factors into the map and start background work; return None if nothing was to do.
 
         What has come, up to some ten milliseconds of work, is in the map when `taken` is
         called; up to there the `seconds` of what is returned count. Then it waits up to `budget`
@@ -232,18 +232,18 @@ class Backend:
         return self._updates.settle(stopped)
 
     def alone(self, urgent: bool = False) -> AbstractContextManager[None]:
-        """Keep all solving stopped within the block; urgent : interrupts a `settle`, too."""
+        """Pause all solving within the block; urgent : interrupt a `settle`, too."""
         return self._updates.alone(urgent)
 
     def _help(self, idle: bool, stopped: Stopped) -> bool:
-        """Update in the background; return whether more may be to do later."""
+        """Update in the background; return whether there may be more to do later."""
         if not idle and time.monotonic() < self._called + _PAUSE:
             return True  # a caller's own update would have to wait for it
-        # Where there was nothing to do, there may be once the back end is idle.
+        # If there was nothing to do now, there may be when the back end is idle.
         return self._updates.update(0.0, stopped, idle) is not None or not idle
 
     def _wake(self) -> None:
-        """Tell the background that there may be something to do."""
+        """Wake the background thread: there may be something to do."""
         if self._background is not None:
             self._background.wake()
 
@@ -260,15 +260,15 @@ class Backend:
         return self.snapshot().drawn
 
     def snapshot(self) -> Snapshot:
-        """Return the back end as it is now, the due loops in its graph, to be read at leisure."""
+        """Return a snapshot of the back end, with the due loops as factors; it never changes."""
         return self._keeper.snapshot()
 
     def loop_states(self) -> LoopStates:
-        """Return what has become of each loop, those of the graph first, in its order."""
+        """Return the state of each loop; first those in the graph, in its order."""
         return self.snapshot().loop_states()
 
     def robot(self, robot: int = 0) -> Robot | None:
-        """Return where a robot is; None: no odometry has said yet where it is in this map."""
+        """Return the pose of a robot; None before its first odometry in this map."""
         return self._keeper.robot(robot)
 
     def moved(self, robot: int = 0) -> tuple[Array, Array]:
@@ -276,7 +276,7 @@ class Backend:
         return self._keeper.moved(robot)
 
     def counts(self) -> Counts:
-        """Return how large the graph is, and what was noted of messages."""
+        """Return the size of the graph, and the counts of refused and unusual messages."""
         with self._keeper.reading() as builder:
             revision = self.revisions.now
             notes = builder.notes
@@ -291,7 +291,7 @@ class Backend:
         return Behind.of(state, size.loops, time.monotonic(), self._updates.failing)
 
     def news(self) -> list[str]:
-        """Return what is new in the notes on messages; see `GraphBuilder.notes`."""
+        """Return new sentences on messages since the last call, see `GraphBuilder.notes`."""
         with self._keeper.reading() as builder:
             return builder.notes.news()
 
@@ -299,7 +299,7 @@ class Backend:
         """
         Return the covariance of a keyframe in its own axes, (d, d).
 
-        Of the least squares map of the accepted factors, with the noise that was found in them:
+        It is that of the least squares map of the accepted factors, with the estimated noise,
         relative to the keyframe `seen_from`, if any, else to the first one, or to the world where
         absolute poses are accepted. None: the map does not have one of them, or its graph is too
         dense to be factored.

@@ -7,13 +7,13 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What is said of the factors of a growing graph: one table, one row per factor.
+The state of the factors of a growing graph: a table with one row per factor.
 
-In: what the gate of the front says of new factors, what the judge says of all of them, and the
-factors that a map was made of. Out: which factors are accepted, and who says so.
+In: the results of the front's gate for new factors and of the judge for all factors, and which
+factors a map uses. Out: which factors are accepted, and whether the front or the judge decided it.
 
-A person's word, `trusted` and `struck`, is a column of the factors themselves, and overrules
-whatever stands here; factors behind the last row were not looked at yet.
+A person's decisions, `trusted` and `struck`, are columns of the factors themselves, and overrule
+this table. Factors behind the last row were not examined yet.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.robust.judgement import Judgement
 
-# Who set a row last. Nobody: the factor was in a graph that was solved without judging it.
+# Who set a row last. Nobody: the factor was in a graph that was solved without a judgement.
 NOBODY, FRONT, JUDGE, PERSON = range(4)
 
 # accepted, suspect, sigmas, noise : see `Judgement`, noise is NaN until a judgement; said_by : one
@@ -38,14 +38,14 @@ NOBODY, FRONT, JUDGE, PERSON = range(4)
 ROW = np.dtype([('accepted', bool), ('suspect', bool), ('in_map', bool), ('proved', bool),
                 ('said_by', np.int32), ('sigmas', float), ('noise', float)])
 
-# So many more rows at least come before all are moved.
+# Least number of rows for which room is made.
 _ROOM = 64
 
 
 @dataclass(frozen=True)
 class FactorTable:
     """
-    The table at one moment; what comes later is written elsewhere.
+    The table at one moment; later changes make new tables.
 
     rows : (m,) of `ROW`, in the order of the factors; looked : how many of the first rows the
     front or the judge has examined; is_map_of_accepted : whether the map uses the accepted ones of
@@ -59,7 +59,7 @@ class FactorTable:
 
     @staticmethod
     def of(rows: Any) -> 'FactorTable':
-        """Return the table of some rows, which nobody else writes to, and room for more."""
+        """Return a table of these rows, with room for more; the caller gives up the array."""
         store = GrowingArray((), ROW, len(rows) + len(rows) // 8 + _ROOM)
         store.extend(rows)
         looked = rows[rows['said_by'] != NOBODY]
@@ -68,7 +68,7 @@ class FactorTable:
 
     @staticmethod
     def of_judgement(judgement: Judgement) -> 'FactorTable':
-        """Return the table of what was judged; the map is of what is accepted."""
+        """Return the table of a judgement whose map uses exactly the accepted factors."""
         return FactorTable.of(_rows(judgement, JUDGE))
 
     @property
@@ -83,7 +83,7 @@ class FactorTable:
         return not (self.rows['proved'][:self.looked] & ~self.accepted).any()
 
     def judgement(self, of_all: Judgement) -> Judgement:
-        """Return what the judge said, with what `of_all` says of the first factors as a whole."""
+        """Return the rows as a judgement; of_all : the last one, for values that have no rows."""
         rows = self.rows[~np.isnan(self.rows['noise'])]
         return replace(of_all, accepted=rows['accepted'], suspect=rows['suspect'],
                        sigmas=rows['sigmas'], noise=rows['noise'])
@@ -106,7 +106,7 @@ class FactorTable:
         return FactorTable(store.view(), len(store), self.is_map_of_accepted, store)
 
     def told(self, factors: BetweenFactors) -> 'FactorTable':
-        """Return the table with a person's decisions applied; itself where nothing changes."""
+        """Return the table with a person's decisions applied; itself if nothing changes."""
         if not (factors.trusted.any() or factors.struck.any()):
             return self
         before = self.accepted
@@ -134,7 +134,7 @@ class FactorTable:
     def adopted(self, made: Judgement, looks: Sequence[Look], end: int, again: bool,
                 proved: bool) -> 'FactorTable':
         """
-        Return the table once a map is published; what stands in it is kept.
+        Return the table after a map was published.
 
         Parameters
         ----------

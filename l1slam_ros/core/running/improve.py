@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The numerical step behind an update: a better map of a snapshot, and a front that goes on from it.
+The numerical work behind updates: a better map of a snapshot, and a front that continues from it.
 
-In: a `Problem`. Out: an `Improvement`, to be adopted, and its `Front`. Nothing here knows of
-threads or locks; who may have to stop the work hands in a check.
+In: a `Problem`. Out: an `Improvement`, to be adopted, and its `Front`. This module uses no threads
+or locks; to stop the work, a caller passes a check that raises.
 """
 
 import time
@@ -68,14 +68,14 @@ _OUTER, _INNER = 2, 120
 # Gauss-Newton steps for the least squares map of the gate, each time it is made.
 _L2_STEPS = 4
 
-# A check that is called often; it raises `Interrupted` where the work shall stop.
+# A function that is called often and raises `Interrupted` if the work is to stop.
 Check = Callable[[], None]
 
 
 @dataclass(frozen=True)
 class Improvement:
     """
-    What one update did: new poses (n, p), dual (rows,) and judgement, and the account of it.
+    The result of one update: poses (n, p), dual (rows,), judgement, and statistics.
 
     map : of the `Problem`; cost_before, cost : L1 cost of the accepted factors;
     reweighted_steps : factorisations for the long-range part; outer, inner : iterations of
@@ -97,7 +97,7 @@ class Improvement:
 
     def taken_over(self, before: Optimised, tolerance: float) -> Optimised:
         """
-        Return what the back end has after it; tolerance : see `OptimiserOptions`.
+        Return the solution that the back end keeps; tolerance : see `OptimiserOptions`.
 
         Raises
         ------
@@ -113,7 +113,7 @@ class Improvement:
                          before.quiet_updates + 1 if quiet else 0)
 
     def of_all(self, problem: Problem) -> 'Improvement':
-        """Return what was made of `as_one(problem)`, for the factors of the problem."""
+        """Convert a result for `as_one(problem)` to one for the factors of the problem."""
         graph = problem.graph
         rows = graph.not_struck
         d = graph.manifold.TANGENT_SIZE
@@ -189,7 +189,7 @@ def one_round(options: OptimiserOptions, sparse: bool) -> OptimiserOptions:
 
 
 def _nearest(problem: Problem) -> tuple[Array, Array, float]:
-    """Return the best poses to start from, their residual, and the cost where the map is."""
+    """Return the best poses to start from, their residual, and the cost of the present map."""
     graph, starts = problem.part, problem.starts
     if graph.between.is_absolute.any():
         # The map may not have been moved to its absolute poses yet.
@@ -207,7 +207,7 @@ def _best(graph: FactorGraph, starts: list[Array],
 
 
 def _dual_of(problem: Problem, e: Array) -> Array:
-    """Return the dual to start from, (rows,): the kept one, else one made of the residual."""
+    """Return the dual to start from, (rows,): the kept one, or one computed from the residual."""
     dual = problem.dual.reshape(-1, problem.graph.manifold.TANGENT_SIZE)
     kept = dual[problem.judgement.accepted]
     asked = (e / np.hypot(e, smoothing(e))).reshape(kept.shape)
@@ -256,9 +256,9 @@ def front_of(problem: Problem, poses: Array, rows: int,
 def optimise(problem: Problem, options: OptimiserOptions,
              check: Check = lambda: None) -> Improvement:
     """
-    Solve a snapshot to the end; where loops are doubted, after judging all of them anew.
+    Solve a snapshot to the optimum; with judged loops, after judging all of them anew.
 
-    Else from its own poses and from the seed, whichever ends lower.
+    Otherwise it is solved from its own poses and from the seed, and the lower result is taken.
     """
     start = time.monotonic()
     graph, judgement = problem.graph, problem.judgement

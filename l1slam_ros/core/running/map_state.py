@@ -7,15 +7,15 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The state of the map of a running back end, at one moment, and how one state follows from another.
+The state of the map of a running back end, and its transitions.
 
-In: a state, and what was made of a snapshot of it. Out: the state after that. States are frozen
-and the transitions pure: who holds one need not hold a lock.
+In: a state, and a result computed from a snapshot of it. Out: the next state. States are frozen
+and the transitions are pure, so that they can be read without a lock.
 
-    adopted     a new map, and a front that carries what comes next
-    taken       new factors, by that front
-    judged      what the judge says of all factors
-    told        what a person says of some
+    adopted     a new map, and a front that takes the next factors
+    taken       that front has taken new factors
+    judged      the judge has judged all factors
+    told        a person has vouched for factors or struck them out
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.solvers.optimality import Status
 
-# Stands for the number of judged loops when a person has decided something since.
+# Used as the number of judged loops after a person's decision: all are to be judged again.
 _TOLD_SINCE = -1
 
 
@@ -61,7 +61,7 @@ class Carried(NamedTuple):
 @dataclass(frozen=True)
 class Judged:
     """
-    What the judge has done, and when [s].
+    What the judge has done so far, and when [s].
 
     loops : how many were judged; anew : how many were judged from the graph alone;
     doubted : how many there were when a judgement last doubted its own refusals; poses : (n, p)
@@ -84,7 +84,7 @@ class Judged:
 
     def after(self, judgement: Judgement, poses: Array, loops: int, anew: bool,
               now: float) -> 'Judged':
-        """Return it after a judgement of so many loops; anew : from the graph alone."""
+        """Return the record after a judgement of `loops` loops; anew : from the graph alone."""
         doubted = loops if judgement.is_refusal_doubted else self.doubted
         after = replace(self, loops=loops, poses=poses, compared=None, doubted=doubted, ended=now)
         if anew:
@@ -95,7 +95,7 @@ class Judged:
 @dataclass(frozen=True)
 class MapState:
     """
-    What is known of the map of one graph.
+    The state of the map of one graph.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class MapState:
     @staticmethod
     def beginning(began: int, robust: bool, optimised: Optimised, judgement: Judgement,
                   judged_loops: int) -> 'MapState':
-        """Return the state in which a map begins, that of a saved one; judged_loops : of these."""
+        """Return the first state of a map, new or saved; judged_loops : of a saved map."""
         none = Judgement.nothing()
         of_all = replace(judgement, accepted=none.accepted, suspect=none.suspect,
                          sigmas=none.sigmas, noise=none.noise)
@@ -150,7 +150,7 @@ class MapState:
         return self.last is not None and self.last.falls
 
     def all_judged(self, loops: int) -> bool:
-        """Return whether none of so many loops waits to be judged."""
+        """Return whether none of `loops` loops waits to be judged."""
         return not self.robust or (self.of_all.settled and self.judged.loops == loops)
 
     def all_judged_anew(self, loops: int) -> bool:
@@ -170,7 +170,7 @@ class MapState:
         return replace(self, table=table, judged=replace(self.judged, loops=_TOLD_SINCE))
 
     def taken(self, looks: Sequence[Look], carried: Carried) -> 'MapState':
-        """Return the state once the front has taken some factors, which it looked at."""
+        """Return the state after the front has taken and gated some factors."""
         # At what it takes again nobody else looks.
         new = looks[max(self.table.looked - (carried.rows - len(looks)), 0):]
         judged = self.judged
@@ -180,7 +180,7 @@ class MapState:
         return replace(self, table=self.table.with_looks(new), carried=carried, judged=judged)
 
     def being_judged(self, now: float) -> 'MapState':
-        """Return the state while the judge looks at all loops that there are."""
+        """Return the state while the judge works on all present loops."""
         return replace(self, judged=replace(self.judged, wanted=False, began=now))
 
     def judged_by(self, judgement: Judgement, poses: Array, loops: int, anew: bool,
@@ -200,7 +200,7 @@ class MapState:
         return after._committed(judgement, factors)
 
     def _committed(self, judgement: Judgement, factors: BetweenFactors) -> 'MapState':
-        """Return the state whose table says what was judged."""
+        """Return the state with a judgement in its table."""
         none = self.of_all
         return replace(
             self, table=self.table.judged(judgement, factors),
@@ -211,7 +211,7 @@ class MapState:
                 pending: Judgement | None, factors: BetweenFactors, tolerance: float,
                 now: float) -> 'MapState':
         """
-        Return the state once a map is published.
+        Return the state after a map was published.
 
         Parameters
         ----------
@@ -245,7 +245,7 @@ class MapState:
         return replace(self, of_all=of_all, judged=replace(self.judged, compared=self.optimised))
 
     def account(self, loops: int, seconds: float) -> Improvement:
-        """Return the account of the last map for an update that took so many seconds."""
+        """Return the last `Improvement`, as the result of an update that took `seconds`."""
         settled = self.all_judged(loops)
         last = self.last
         if last is None:

@@ -18,7 +18,7 @@ from l1slam_ros.core.online.robot_odometry import RobotOdometry
 
 class Newest(NamedTuple):
     """
-    The last keyframe of a robot in the map, which its keyframes to come follow.
+    The last keyframe of a robot in the map; later ones follow from it by odometry.
 
     keyframe : its number among those of the robot, -1: there is none; pose : (1, p) in the map of
     the robot; joined : that is the map of the first robot
@@ -34,7 +34,7 @@ class MapToOdom:
 
     def __init__(self, newest: Newest):
         self.begin(newest)
-        # Before the first map and after the last that nobody asked for yet.
+        # The transform at the previous call of `moved`, and now.
         self._moved: tuple[Array, Array] | None = None
 
     @property
@@ -43,13 +43,13 @@ class MapToOdom:
         return self._newest.joined
 
     def begin(self, newest: Newest) -> None:
-        """Begin where another map ends."""
+        """Begin with the transform at the end of another map."""
         self._newest = newest
         # Asked for with every sample: worked out when an update or a new offset changes it.
         self._known: tuple[Array, Array] | None = None
 
     def move(self, robot: RobotOdometry, newest: Newest) -> None:
-        """Go on where the map ends by now."""
+        """Update the transform to the present end of the map."""
         before = self.now(robot)
         self.begin(newest)
         self._moved = (self._moved or (before,))[0], self.now(robot)
@@ -66,7 +66,7 @@ class MapToOdom:
         return self._known[1]
 
     def moved(self, robot: RobotOdometry) -> tuple[Array, Array]:
-        """Return the transform as it was when this was asked before, and as it is now."""
+        """Return the transform at the previous call of this method, and now."""
         before, after = self._moved or 2 * (self.now(robot),)
         self._moved = None
         return before, after

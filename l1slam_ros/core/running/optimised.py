@@ -23,7 +23,7 @@ _QUIET_UPDATES = 5
 @dataclass(frozen=True)
 class Optimised:
     """
-    The last solution: of the keyframes and factors that there were when it began.
+    The last solution, for the keyframes and factors that existed when it began.
 
     poses : (k, p); dual : (rows,); cost, status : as the last map left them; quiet_updates : how
     many in a row hardly lowered the cost.
@@ -37,7 +37,7 @@ class Optimised:
 
     @staticmethod
     def nothing(poses: Array) -> 'Optimised':
-        """Return the solution before the first update: poses at most."""
+        """Return the solution before the first update, with poses or without."""
         return Optimised(poses, np.zeros(0), 0.0, Status.OUT_OF_TIME, 0)
 
     @property
@@ -47,5 +47,5 @@ class Optimised:
                 or self.quiet_updates >= _QUIET_UPDATES)
 
     def unfinished(self) -> 'Optimised':
-        """Return the same where more is to be done."""
+        """Return the same solution, marked as not converged."""
         return replace(self, status=Status.OUT_OF_TIME)

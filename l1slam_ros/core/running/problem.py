@@ -39,7 +39,7 @@ _HEADING = 1.0
 @dataclass(frozen=True)
 class Problem:
     """
-    A graph to optimise, and where to start.
+    A graph to optimise, with a warm start.
 
     map : names the map that it is of, another after `Backend.reset` and `Backend.restore`; graph :
     all factors; starts : poses (n, p) to start from, `poses` the first; dual : (rows,) to start
@@ -74,12 +74,12 @@ class Problem:
 
     @cached_property
     def method(self) -> Method:
-        """What to solve them by."""
+        """The solver for these factors."""
         return choose(AUTO, self.part, before=self.pattern)
 
     @property
     def is_sparse(self) -> bool:
-        """Whether they are solved by factorisations."""
+        """Whether that solver uses factorisations."""
         return self.method.solver != PRIMAL_DUAL
 
 

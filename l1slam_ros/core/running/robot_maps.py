@@ -9,15 +9,14 @@
 """
 The map that each robot is in: the map of the first robot, or still a map of its own.
 
-In: a graph, what is accepted of it, and where keyframes are in it. Out: of each robot whether an
-accepted factor joins it to the first one, and what takes its keyframes to the map that it is
-published in. The graph has one frame for all; where a robot that nothing joins is in it, is a
-guess. Its own map begins with its first keyframe where its odometry has that, as the map of the
-only robot does.
+In: a graph, its accepted factors, and its poses. Out: for each robot, whether an accepted factor
+joins it to the first one, and the transform of its keyframes to the map in which it is published.
+The graph has one frame for all robots; the place of an unjoined robot in it is a guess. The map of
+such a robot begins where its odometry begins, as does the map of a single robot.
 
-Parts of one robot, from before and after a gap, count as joined. Where absolute poses are
-accepted, the map of the first robot is that of the world, and who is not tied to it, the first
-robot too, is in a map of its own.
+Parts of one robot, from before and after a gap, count as joined. If absolute poses are accepted,
+the map of the first robot is that of the world, and a robot that is not tied to the world, even
+the first one, has a map of its own.
 """
 
 from collections.abc import Callable
@@ -76,7 +75,7 @@ def robot_maps(manifold: Manifold, robot: Indices, firsts: Indices, factors: Bet
 
 class Seen(NamedTuple):
     """
-    What a graph was at a moment; it is read without a lock.
+    The graph at one moment, which can be read without a lock.
 
     factors : of it; robot : (n,) of each keyframe; numbers : of each robot the keyframes, (k,);
     firsts : (r, p) the odometry of their first ones, by robot
@@ -90,7 +89,7 @@ class Seen(NamedTuple):
 
     @staticmethod
     def of(builder: GraphBuilder) -> 'Seen':
-        """Return what is seen of the graph of a builder."""
+        """Return a copy of the graph of a builder."""
         tracks = {robot: one.track for robot, one in builder.robots.items() if len(one.track)}
         firsts = {robot: track.poses_of(slice(0, 1)) for robot, track in tracks.items()}
         return Seen(builder.graph.manifold, builder.graph.between, builder.graph.robot,

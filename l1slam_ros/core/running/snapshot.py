@@ -9,8 +9,8 @@
 """
 The back end at one moment: a cheap copy that is read while the back end goes on.
 
-In: references to arrays that are never written to again. Out: what is worked out of them, the
-problem of the next update first of all.
+In: references to arrays that are not written to again. Out: values computed from them, above all
+the problem of the next update.
 """
 
 from dataclasses import dataclass, replace
@@ -39,7 +39,7 @@ WAITING, SUSPECT, ACCEPTED, REJECTED, EXPIRED = range(len(LOOP_STATES))
 @dataclass(frozen=True)
 class LoopStates:
     """
-    What has become of the loops.
+    The states of all loops.
 
     rows : (k,) the between factors of the first k of them; stamps : (l, 2) [ns] reference and end;
     state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at; robots :
@@ -117,7 +117,7 @@ class Behind:
 
     @staticmethod
     def of(state: MapState, loops: int, now: float, failing: bool) -> 'Behind':
-        """Return what goes on behind a state, with so many loops in the graph."""
+        """Return how far the work is behind a state, with `loops` loops in the graph."""
         carried = state.carried
         holds = state.table.is_proof_of_accepted
         waiting = 0 if state.all_judged(loops) else loops - max(state.judged.loops, 0)
@@ -150,7 +150,7 @@ class Snapshot:
 
     @property
     def map(self) -> int:
-        """What names the map, see `Improvement`."""
+        """The number of the map, see `Improvement`."""
         return self.state.began
 
     @cached_property
@@ -211,11 +211,11 @@ class Snapshot:
 
     @cached_property
     def judgement(self) -> Judgement:
-        """What is believed of all factors, as the map has it."""
+        """The judgement of all factors that the map uses."""
         return self._of_all(self.state.table.judgement(self.state.of_all))
 
     def _of_all(self, judged: Judgement) -> Judgement:
-        """Return a judgement of the first factors, with what the front says of the others."""
+        """Return a judgement of the first factors, extended by the front's gate for the others."""
         state = self.state
         known = state.table.behind(judged)
         all_judged = state.all_judged(len(self.loop_rows)) and state.pending is None
@@ -231,7 +231,7 @@ class Snapshot:
         return state.table.looked if self.views else len(self.graph.between)
 
     def problem(self) -> Problem:
-        """Return what an update begins with: the graph, and the warm start for all of it."""
+        """Return the problem of an update: the graph, with a warm start for all of it."""
         state = self.state
         last = self.state.optimised
         rows = len(self.graph.between) * self.graph.manifold.TANGENT_SIZE
@@ -250,7 +250,7 @@ class Snapshot:
                        self._followed(last.poses, self.odometry), pattern=self.pattern)
 
     def optimised(self) -> Optimised:
-        """Return the map that was solved for, grown to all keyframes and factors there are."""
+        """Return the last solution, extended to all present keyframes and factors."""
         problem = self.problem()
         last = self.state.optimised
         same = len(last.poses) == len(problem.poses) and len(last.dual) == len(problem.dual)
@@ -270,7 +270,7 @@ class Snapshot:
                           np.concatenate(self.loop_robots))
 
     def sizes(self) -> dict[str, int]:
-        """Return how many keyframes, factors and loops of each state there are, by name."""
+        """Return the numbers of keyframes, factors and loops of each state, by name."""
         loops = np.bincount(self.loop_states().state, minlength=len(LOOP_STATES))
         return {'keyframes': self.graph.n_poses, 'factors': len(self.graph.between)} | {
             f'{name}_loops': int(count) for name, count in zip(LOOP_STATES, loops, strict=True)}

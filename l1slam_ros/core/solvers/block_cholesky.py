@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-One sparse factorisation for all: Cholesky of J'WJ in blocks of a keyframe's size.
+Sparse Cholesky factorisation of J'WJ in blocks of a keyframe's size, used by all solvers.
 
-In: which keyframes each factor joins. Out: solutions of normal equations. The order of elimination
+In: the keyframes of each factor. Out: solutions of normal equations. The order of elimination
 and the pattern of the factor are those of keyframes, found once (`Pattern`) and used for blocks of
 every size: of the rotations alone, of the translations, of whole poses.
 """
@@ -42,16 +42,16 @@ Columns = tuple[Places, Indices, Places]
 _NONE = np.zeros(0, np.int64)
 _NO_COLUMNS = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32)
 
-# Multiplications for each keyframe from which a factorisation is long: what another order spares
-# of a few of them is then more than it takes to find.
+# Multiplications per keyframe from which a factorisation is long: then a better order saves more
+# time than it takes to find.
 _LONG = 8000
-# Multiplications of numbers, some 50 ms, from which separators may pay for the loops that find
-# them: those are compiled at their first use on a machine, for 5 s.
+# Multiplications, some 50 ms, from which separators are tried. The loops that find them are
+# compiled at their first use on a machine, which takes 5 s.
 VAST = 1.5e8
-# A graph that has grown by more is ordered anew, which is seldom enough to cost nothing. Had it
-# never been, City's last factorisation, six thousand keyframes on, would do a quarter more work.
+# A graph that has grown by more than this fraction is ordered anew, which is rare. Without that,
+# City's last factorisation, six thousand keyframes later, would do a quarter more work.
 GROWN = 1.1
-# Multiplications of numbers from which a factorisation, of some 2 ms, is worth a second thread.
+# Multiplications, some 2 ms, from which a factorisation uses a second thread.
 _SHARED = 20e6
 # Part of its diagonal by which a loose keyframe is damped: above what factorising leaves of a
 # pivot that is none, and for a heading the same as to know it to within thousands of turns.
@@ -98,7 +98,7 @@ class Pattern:
 
     @property
     def blocks(self) -> int:
-        """Blocks in all panels."""
+        """Number of blocks in all panels."""
         return int((np.diff(self.first) * np.diff(self.start)).sum())
 
     @cached_property
@@ -110,10 +110,10 @@ class Pattern:
 def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
                  before: Pattern | None = None, uses: int = _FACTORISATIONS) -> Pattern:
     """
-    Return a pattern of little fill.
+    Return an elimination order with little fill, and the pattern of its factor.
 
-    By minimum degree; where a factorisation is long, by dissection of levels too, where it still
-    is very long, of separators; the best of them.
+    The best of: minimum degree; for a long factorisation, level-set dissection; and for one that
+    is still very long, dissection by separators.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
 
 
 def needs(graph: FactorGraph, blocks: float, work: float) -> memory.Needs:
-    """Predict the needs of a graph from the blocks and the work of its factor."""
+    """Predict the time and memory of solving a graph from the blocks and work of its factor."""
     k = graph.manifold.TANGENT_SIZE
     m = len(graph.between)
     return memory.Needs(blocks * _bytes_of_block(graph) + _BYTES_PER_ENTRY * k**2 * m,
@@ -158,7 +158,7 @@ def needs(graph: FactorGraph, blocks: float, work: float) -> memory.Needs:
 
 
 def most_blocks(graph: FactorGraph) -> int:
-    """Return how many blocks a factor of the graph may have that is to fit into memory."""
+    """Return the largest number of blocks of a factor that fits into the free memory."""
     left = (memory.free() - needs(graph, 0.0, 0.0).memory) / _bytes_of_block(graph)
     return int(min(max(left, 0.0), graph.n_poses * (graph.n_poses + 1.0)))
 
@@ -175,7 +175,7 @@ def _bytes_of_block(graph: FactorGraph) -> int:
 
 def _laid_out(graph: tuple[Places, Places], most_blocks: int, stage: Places, begun: Columns,
               found: int) -> Pattern | None:
-    """Return the pattern of an order by minimum degree; None: it would have too many blocks."""
+    """Return the pattern of a minimum degree order; None if it has too many blocks."""
     if len(begun[-1]) > most_blocks:
         return None
     columns = kernels.ordering.minimum_degree(*graph, most_blocks, stage, *begun)
@@ -200,7 +200,7 @@ def neighbours(keyframe: Indices, size: int) -> tuple[Places, Places]:
 
 class BlockCholesky:
     """
-    Factors the normal matrices of all systems that join the same keyframes.
+    Factors the normal matrices of all systems whose factors join the same keyframes.
 
     Parameters
     ----------
@@ -356,5 +356,5 @@ def cholesky_of(graph: FactorGraph, before: Pattern | None = None,
 
 
 def with_pattern(pattern: Pattern, graph: FactorGraph) -> BlockCholesky:
-    """Return what factors the systems of a graph, by a pattern of all its factors."""
+    """Return the Cholesky factorisation for a graph with a given pattern."""
     return BlockCholesky(pattern, keyframes_of(graph, anchor(graph)), loose_keyframes(graph))

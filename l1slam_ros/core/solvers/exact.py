@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The exact L1 map of a graph: rough L2 first where that helps, then one interior-point run.
+The exact L1 map of a graph: a rough L2 map first if that helps, then one interior-point run.
 
-In: a graph and poses. Out: poses at a local optimum, and the bound that a dual proves on the cost
-that may be left.
+In: a graph and poses. Out: poses at a local optimum, and a dual that proves by how much the cost
+can still fall.
 """
 
 import numpy as np
@@ -83,7 +83,7 @@ def prove(optimum: Optimum, cholesky: BlockCholesky) -> tuple[Array, float, Stat
 
 
 def proven(status: Status, gap: float, cost: float, rows: int) -> Status:
-    """Return the status of a run in the light of what its dual proves."""
+    """Return the status of a run: not converged if its dual proves too large a gap."""
     if fits_exactly(cost, rows) or gap <= _CLOSE * cost:
         return Status.CONVERGED
     return Status.STALLED if gap > _PROVEN * cost and status is Status.CONVERGED else status

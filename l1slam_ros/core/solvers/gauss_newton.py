@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What L1 is compared with: Gauss-Newton for L2, and Huber, on the same linearisation.
+Gauss-Newton for L2 and Huber, on the same linearisation as the L1 solvers.
 
 In: a graph and poses. Out: poses of lower cost. Both solve sparse normal equations. A step that
 brings less than half of what it promised is shortened to the lowest point of a parabola, or its
@@ -70,7 +70,7 @@ _SHORTEST = 0.25
 @dataclass(frozen=True)
 class LeastSquaresOptions:
     """
-    How long Gauss-Newton runs and when it is content.
+    When Gauss-Newton stops.
 
     iterations : most linearisations; tolerance : converged when the cost fell by no more than this
     part of itself; huber_delta : length of a factor's whitened residual where Huber turns linear

@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The L1 map to the last digits: one nonlinear primal-dual interior-point run (Mehrotra's steps).
+The exact L1 map by one nonlinear primal-dual interior-point run (Mehrotra's method).
 
 In: a graph and poses near the map. Out: poses at a local optimum. Where Algorithm 4 solves many
 linear problems one after the other, this relinearises at every step of a single solve. With
@@ -21,7 +21,7 @@ else holds a step back: damping would keep a long way from bending while mu goes
 it ended 9% above the optimum of a square that closes after 3,000 keyframes.
 
 It costs one sparse factorisation a step, some twenty in all: cheap on sparse graphs, hopeless on
-dense ones. It is local: started far off it can return its start, which it says by its status.
+dense ones. It is local: from a start far off it can return that start, which its status tells.
 
 The same run solves a linear problem (the two of Algorithm 3): one whose linearisation is exact.
 
@@ -44,9 +44,9 @@ from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import Report
 from l1slam_ros.core.solvers.optimality import Status, fits_exactly, l1_cost, smoothing
 
-# How far to go towards the nearest bound.
+# Fraction of the way to the nearest bound that a step may go.
 _FRACTION = 0.9995
-# A step cut to less by the bounds has run into them: the next does no more than to leave them.
+# A step that the bounds cut to less is followed by a centring step, which only leaves the bounds.
 _SHORT = 0.1
 # Slacks are kept above this and never recomputed as 1 -+ y, which would cancel.
 _SMALLEST_SLACK = 1e-15
@@ -106,7 +106,7 @@ class _Iterate:
 
     @property
     def bounded(self) -> tuple[Array, Array, Array, Array]:
-        """What must stay positive: u, v, s, t."""
+        """The variables that must stay positive: u, v, s, t."""
         return self.u, self.v, self.s, self.t
 
     def advance(self, direction: '_Direction', primal: float) -> None:
@@ -127,7 +127,7 @@ class _Iterate:
 @dataclass(frozen=True)
 class Optimum:
     """
-    What a run ended with: the best poses met, never worse than the start.
+    The result of a run: the best poses found, never worse than the start.
 
     costs : (steps + 1,) the lowest so far; end : the last iterate, linearised at the best, for
     `prove`.

@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Algorithm 4: the outer loop. Linearise as for L2, primal-dual solve, retract, accept or shrink.
+Algorithm 4, the outer loop: linearise as for L2, solve by primal-dual, retract, accept or shrink.
 
 In: a graph, poses and the dual of an earlier solve, if any. Out: poses of lower L1 cost. The
 dual is kept from one linearisation to the next: restarted from zero, the loop stalls above the
@@ -48,7 +48,7 @@ _HALVINGS = 5
 
 @dataclass(frozen=True)
 class OptimiserOptions(Options):
-    """How long Algorithm 4 runs and when it is content."""
+    """When Algorithm 4 stops, and the options of its inner solver."""
 
     norm: str = option(
         NORMS[0], 'norm that `l1slam` and `~/optimize` minimise; the updates in between always '
@@ -67,7 +67,7 @@ class OptimiserOptions(Options):
 @dataclass(frozen=True)
 class Solution:
     """
-    What a solver ended with.
+    The result of a solver.
 
     poses : (n, p); cost : of the norm it minimises; history : (outer_iterations + 1,) costs,
     the start first; dual : (rows,) and gap : of the last linear problem, see `duality_gap`; L2 and
@@ -149,7 +149,7 @@ def minimise(
 def _start(
     system: LinearSystem, dual: Array | None, cholesky: BlockCholesky | None
 ) -> tuple[Array, Array]:
-    """Return where a linear problem begins, (columns,) and (rows,): by `cholesky` if given."""
+    """Return the start of a linear problem, (columns,) and (rows,), by `cholesky` if given."""
     if cholesky:
         return reweighted_start(system, cholesky)
     x = np.zeros(system.size * system.block_size)
@@ -157,7 +157,7 @@ def _start(
 
 
 def is_far(before: float, after: float) -> bool:
-    """Tell whether a cost that fell that much leaves a linear problem unlike the last one."""
+    """Tell whether the cost fell so much that the next linear problem differs from the last."""
     return before - after > _FAR * after
 
 
@@ -168,7 +168,7 @@ def backtrack(
     """
     Return poses and residual after the longest of step, step/2, ... that lowers the cost.
 
-    Where none does, both are returned as they came. cost_of : of a residual
+    If none does, poses and residual are returned unchanged. cost_of : the cost of a residual
     """
     cost = cost_of(residual)
     for halvings in range(_HALVINGS + 1):

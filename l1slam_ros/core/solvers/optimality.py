@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-How good an answer is, recomputed from the problem itself: objectives, duality gap, status.
+Measures of a solution, computed from the problem itself: norms, duality gap, status.
 
-Nothing here trusts what a solver says of its own result.
+Nothing here relies on values that a solver reports about its own result.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ _CURVED = 1e-9
 
 
 class Status(str, Enum):
-    """Which test ended a solve."""
+    """The test that ended a solve."""
 
     CONVERGED = 'converged'
     ITERATION_LIMIT = 'iteration_limit'
@@ -59,7 +59,7 @@ def l2_cost(residual: Array) -> float:
 
 
 class Smoothed(NamedTuple):
-    """A norm without corners at e (m, k): cost, gradient (m, k), curvature (m, k, k)."""
+    """A smoothed norm at e (m, k): cost, gradient (m, k), curvature (m, k, k)."""
 
     cost: float
     gradient: Array
@@ -82,7 +82,7 @@ class Norm(Protocol):
         """Return F(r)."""
 
     def resolvent(self, dual: Array, sigma: Array | float) -> Array:
-        """Return (I + sigma dF*)^-1 of a dual (rows,); with sigma 0 the nearest that may be."""
+        """Return (I + sigma dF*)^-1 of a dual (rows,); for sigma 0 the nearest feasible dual."""
 
     def gap(self, residual: Array, dual: Array) -> float:
         """Return F(r) + F*(y) - y'r, 0 or more; with A'y = 0 what a linear problem can lose."""
@@ -98,7 +98,7 @@ class SmoothNorm(Norm, Protocol):
         """Return F near e (m, k), each corner rounded by mu, to be minimised with the dual y."""
 
     def reach(self, y: Array, dy: Array) -> float:
-        """Return how far a dual can go along dy until it has left what may be."""
+        """Return how far a feasible dual can go along dy before it becomes infeasible."""
 
     def slack(self, y: Array) -> Array:
         """Return how far each row of a dual may move, (rows,)."""

@@ -46,7 +46,7 @@ Resolvent = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class PrimalDualOptions(Options):
-    """How long a primal-dual solve runs and when it is content."""
+    """When a primal-dual solve stops."""
 
     iterations: int = option(
         400, 'largest number of iterations of one primal-dual solve', '', 1, 10**7)
@@ -57,7 +57,7 @@ class PrimalDualOptions(Options):
 @dataclass(frozen=True)
 class PrimalDualSolution:
     """
-    What a primal-dual solve ended with.
+    The result of a primal-dual solve.
 
     x : (columns,) step; y : (rows,) dual; objective : |A x - b|_1; gap : see `duality_gap`;
     history : (k, 2) rows (iteration, objective), the start first; weight : the primal weight.

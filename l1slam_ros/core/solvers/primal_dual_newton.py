@@ -7,12 +7,13 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Group L1, and norms that differ from factor to factor, to the last digits.
+Newton's method for group L1 and for mixed norms, to the exact optimum.
 
-In: a graph, poses and a norm. Out: poses at a local optimum, a dual and what it proves. A length
-has no derivative at zero, where many end, so |e| becomes R = sqrt(|e|^2 + mu^2), and mu goes to
-zero. The dual y of each factor, |y| <= 1, is a variable of its own: what is solved is R y = e,
-J'y = 0. A step linearises that,
+In: a graph, poses and a norm. Out: poses at a local optimum, a dual and the gap that it proves.
+
+A length has no derivative at zero, where many residuals end, so |e| is replaced by
+R = sqrt(|e|^2 + mu^2), and mu goes to zero. The dual y of each factor, |y| <= 1, is a separate
+variable, and R y = e, J'y = 0 is solved. A step linearises that,
 
     (J'W J + kappa C) dx = -J'(e / R),    W = (I - (y e' + e y') / 2 R) / R,
     y + dy = e / R + W J dx,
@@ -41,7 +42,7 @@ from l1slam_ros.core.solvers.interior_point import Curvature
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.optimality import SmoothNorm, Status, fits_exactly, smoothing
 
-# Converged when smoothing and the next step would change the cost by less than this part.
+# Converged when smoothing and the next step would change the cost by less than this fraction.
 _TOLERANCE = 1e-6
 # What mu becomes of itself after a full step of poses and dual, and where there was none; and at
 # first of the mean length.
@@ -75,7 +76,7 @@ def minimise_norm(
     """
     Minimise a norm in `options.outer_iterations` steps at most, from the L2 map they lead to.
 
-    That is where all who start in the same valley start; it counts as one step.
+    All starts in the same valley lead to that map; it counts as one step.
     """
     residual = whitened_residual(graph, poses)
     start, rows = norm.cost(residual), len(residual)

@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The fast primal-dual method: reflected Halpern steps, restarted, on blocks scaled once.
+The fast primal-dual method: restarted, reflected Halpern steps on preconditioned blocks.
 
 In: a `LinearSystem` and where to start. Out: as of Algorithm 2, the step x and its dual y.
 

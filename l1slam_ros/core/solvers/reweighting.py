@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Weighted linear least squares by one sparse factorisation, and the start it gives to L1.
+Weighted linear least squares by one sparse factorisation, and starts for L1 from it.
 
 In: a linear system. Out: the step that minimises a weighted sum of squares.
 """

@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Algorithm 3: first poses by two convex L1 problems, from the graph alone.
+Algorithm 3: initial poses by two convex L1 problems, from the graph alone.
 
 In: a factor graph. Out: poses from which Algorithm 4 finds the optimum. The whitened residual's
 rotation rows involve the rotations alone (see `noise`), so they are solved first; with the
@@ -234,7 +234,7 @@ def _minimise(system: LinearSystem, cholesky: BlockCholesky | None,
 
 
 def _unwrap_alike(graph: FactorGraph, poses: Array, others: Array) -> bool:
-    """Tell whether the rotation problems at two sets of poses are one and the same."""
+    """Tell whether the rotation problems at two sets of poses are the same."""
     fixed = anchor(graph)
     part = graph.manifold.ROTATION
     apart = graph.manifold.local(poses, others)[fixed:, part].ravel()

@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The solvers by name, and which one a graph gets where nobody chose.
+The solvers by name, and the choice of a solver for a graph.
 
-In: a graph and poses. Out: the solution, the name of the solver that found it, and why it was it.
+In: a graph and poses. Out: the solution, the name of its solver, and why that was chosen.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from l1slam_ros.core.solvers.primal_dual_newton import minimise_norm
 
 AUTO, PRIMAL_DUAL, INTERIOR_POINT, *_ = SOLVERS
 L1_NORM, GROUP_L1_NORM, *_ = NORMS
-# What other norms are minimised by.
+# The solvers of other norms.
 GAUSS_NEWTON, PRIMAL_DUAL_NEWTON = 'gauss-newton', 'primal-dual-newton'
 # Seconds of the primal-dual method for a factor and entry of its Jacobian, some 14,000 passes over
 # the factors; on a large graph it takes more of them, as that is wider: so many times as often as
@@ -60,7 +60,7 @@ L1_SOLVERS: dict[str, L1Solver] = {
 @dataclass(frozen=True)
 class Method:
     """
-    What a graph is solved by.
+    The solver of a graph.
 
     cholesky : of the graph, None where it does not fit into memory; solver : of `SOLVERS`, not
     `auto`; reason : a clause that says why; falls_back : another solver may go on where it fails;

@@ -31,7 +31,7 @@ from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.io.bounded import read_yaml
 
 _MIB = 2**20
-# [bytes] A chunk or a message: recorders make chunks of some megabytes, cameras messages of tens.
+# [bytes] of a chunk or a message: chunks have some megabytes, messages of cameras tens of them.
 MOST_AT_ONCE = 256 * _MIB
 # The tables of rosbag2 that are read.
 _TABLES = ('topics', 'messages', 'message_definitions', 'metadata')
@@ -42,7 +42,7 @@ class BombError(L1SlamError):
 
 
 def require_small(size: int, what: str) -> None:
-    """Refuse a piece of a bag, of so many bytes, that is larger than any recorder makes one."""
+    """Refuse a piece of a bag of this size [bytes] if it is larger than recorders make."""
     if size > MOST_AT_ONCE:
         raise BombError(f'{what} of {size / _MIB:,.0f} MiB; expected at most '
                         f'{MOST_AT_ONCE // _MIB} MiB')
@@ -50,11 +50,11 @@ def require_small(size: int, what: str) -> None:
 
 def unpacked(compression: str, data: bytes) -> bytes:
     """
-    Return the unpacked data, where it is cut up to the cut; compression : zstd, lz4 or bz2.
+    Return unpacked data, of cut data as far as it goes; compression : zstd, lz4 or bz2.
 
     Raises
     ------
-    BombError : it is more than any recorder packs into one piece.
+    BombError : it is more than recorders pack into one piece.
 
     """
     content: bytes = _UNPACK[compression](data, MOST_AT_ONCE + 1)
@@ -83,7 +83,7 @@ _UNPACK: dict[str, Callable[[bytes, int], Any]] = {'zstd': _zstd, 'lz4': _lz4, '
 
 
 def require_shallow(metadata: Path) -> None:
-    """Refuse a metadata.yaml that would cost its reader minutes; one that is missing is none."""
+    """Refuse a metadata.yaml that would take minutes to parse; it may be missing."""
     if not metadata.is_file():
         return
     require_small(metadata.stat().st_size, metadata.name)
@@ -96,7 +96,7 @@ def require_shallow(metadata: Path) -> None:
 
 def require_tables(database: sqlite3.Connection) -> None:
     """
-    Refuse a database whose tables are something else, or hold what no recorder writes.
+    Refuse a database whose tables are not plain tables, or hold too large messages.
 
     Raises
     ------
@@ -116,13 +116,13 @@ def require_tables(database: sqlite3.Connection) -> None:
                    for name in ('page_count', 'page_size'))
     if pages * size > MOST_AT_ONCE:
         with suppress(sqlite3.DatabaseError):  # one that is cut is read page by page
-            # Of a blob only the length is read.
+            # This reads only the length of the blobs.
             largest, = database.execute('SELECT max(length(data)) FROM messages').fetchone()
             require_small(int(largest or 0), 'a message')
 
 
 def _bound_library() -> None:
-    """Let the bag library unpack with the bounds from here; it has none of its own."""
+    """Make the bag library unpack within these bounds; it has none of its own."""
     for name in ('zstd', 'lz4'):
         storage_mcap.DECOMPRESSORS[name] = lambda data, _, name=name: unpacked(name, data)
     for name in ('bz2', 'lz4'):

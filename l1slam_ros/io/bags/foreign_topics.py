@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a bag hold the pose graph of another front end, as slam_toolbox."""
+"""Finding the topics of a bag with the pose graph of another front end, such as slam_toolbox."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,9 +20,9 @@ from l1slam_ros.io.messages.front_ends import FRONT_ENDS, FrontEnd, front_end_of
 @dataclass(frozen=True)
 class Foreign:
     """
-    The topics of a front end's graph, with their types, and which of them names it.
+    The topics of a front end's graph with their types, and `main`, by which messages name it.
 
-    is_whole : the graph is taken as it is; else only its loops.
+    is_whole : the whole graph is taken, not only its loops.
     """
 
     graph: type[EdgeGraph]
@@ -33,10 +33,10 @@ class Foreign:
 
 def foreign_graph(path: Path, topics: Topics) -> tuple[Topics, Foreign | None]:
     """
-    Return the topics to read, and which of them hold another front end's graph, if any do.
+    Return the topics to read, and the graph of another front end if they have one.
 
-    A bag that has nothing on the default topic of the odometry, and the messages of one front
-    end that tells its odometry, is taken for one of that: of all robots in it.
+    If a bag has no messages on the default topic of the odometry, but those of exactly one front
+    end whose messages include its odometry, that graph is read, with all its robots.
     """
     types = {topic.name: topic.msgtype for topic in bag_summary(path).topics if topic.count}
     for name, is_whole in (topics.odometry, True), (topics.loops, False):
@@ -54,7 +54,7 @@ def foreign_graph(path: Path, topics: Topics) -> tuple[Topics, Foreign | None]:
 
 
 def _beside(main: str, types: dict[str, str], front_end: FrontEnd) -> dict[str, str]:
-    """Return the topics of a front end with the namespace of one of them, and their types."""
+    """Return the topics of a front end that share the namespace of `main`, and their types."""
     space = main.rpartition('/')[0]
     return {name: kind for name, kind in types.items()
             if kind in front_end.topics.values() and name.rpartition('/')[0] == space}

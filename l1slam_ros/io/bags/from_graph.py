@@ -7,24 +7,25 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A graph as the messages of a bag, from which exactly the same graph is read again.
+Writing a graph as the messages of a bag, from which exactly the same graph is read again.
 
     /odom            one nav_msgs/Odometry per keyframe: the odometry factors, chained
     /loop_closures   one geometry_msgs/PoseWithCovarianceStamped per other factor;
                      /trusted_loop_closures for those that are never doubted,
                      and again /false_loop_closures for those that are struck out
-                     /rejected_loop_closures for those that were left out of the map
+                     /rejected_loop_closures for those that the map does not use
     /absolute_poses  the same per absolute factor
-    /ground_truth    geometry_msgs/PoseStamped, where the truth is known
-    /scan            sensor_msgs/LaserScan, where a laser was simulated
+    /ground_truth    geometry_msgs/PoseStamped, if the truth is known
+    /scan            sensor_msgs/LaserScan, if a laser was simulated
 
-Covariances are those of the factors, in the axes of the measured pose: of an odometry message
-that of the motion since the message before. What is left unsaid has an infinite variance. In a bag
-a pose is seen from an earlier one: factors the other way are turned, and the note says which.
+Covariances are those of the factors, in the axes of the measured pose; that of an odometry message
+is of the motion since the message before. A component that is not measured has an infinite
+variance. Messages have the later pose seen from the earlier one: factors in the other direction
+are inverted, and the note in the bag says which.
 
-What a map was made without, see `left_out`, the note names, too: nobody but this program listens
-to its loops, which are on a topic of their own. Odometry that slipped is in the odometry still: a
-bag needs that of every keyframe; and so is an absolute pose.
+The note also names the factors that the map does not use, see `left_out`. Such loops have a topic
+of their own, which only this program reads. Odometry that slipped and absolute poses stay on their
+topics: a bag needs the odometry of every keyframe.
 """
 
 import os
@@ -69,13 +70,13 @@ if TYPE_CHECKING:  # it takes numba along
 
 # What `reader.read_note` returns for a graph.
 GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
-# And besides, where a reader of messages would take some for faults: see `_note`.
+# In addition, if a reader would take some messages for errors: see `_note`.
 VERBATIM_NOTE = {'messages': 'verbatim'}
-# Of a graph whose poses are in space.
+# In addition, for poses in space.
 SPACE_NOTE = {'dimension': '3'}
-# And where factors led from a later keyframe to an earlier one: the numbers of those turned.
+# In addition, the numbers of the factors that were inverted.
 TURNED_STEPS, TURNED_LOOPS = 'turned_steps', 'turned_loops'
-# The numbers, counted in the same way, of what a map was made without.
+# In addition, the numbers, counted in the same way, of factors that the map does not use.
 LEFT_OUT = {SLIP: 'slips', REJECTED: 'rejected_loops', SUSPECT: 'suspect_loops'}
 
 _REFUSED = (REJECTED, SUSPECT)
@@ -87,14 +88,14 @@ _LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
                     truth: Array | None = None, scans: 'Sequence[Scan]' = ()) -> None:
     """
-    Write a graph as the messages a robot would have sent.
+    Write a graph as the messages that a robot would have sent.
 
     Parameters
     ----------
     path : the bag's directory; a bag already there is replaced once the new one is complete
     record : its stamps, or invented ones; its stored poses and vertex ids have no place in a bag
     truth : (n, p) poses in the map frame, or None
-    scans : of a laser that is where the robot is, one for each keyframe and at its stamp, or none
+    scans : of a laser at the robot's origin, one for each keyframe with its stamp, or none
 
     Raises
     ------
@@ -134,7 +135,7 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
                 writer.write(SCAN_TOPIC, stamp, scan_bytes(_BASE_FRAME, scans[k]))
             for loop in loops:
                 topic, frame = ABSOLUTE_TOPIC, 'map'
-                # Of one that is struck out the message before told what it is.
+                # The loop itself was the message before.
                 word = '' if loop.struck else next(in_order)
                 if loop.reference_stamp is not None:
                     topic = _topic(loop, word)
@@ -143,7 +144,7 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
 
 
 def _topic(loop: LoopClosure, word: str) -> str:
-    """Return the topic of a loop; word : what it was left out as, empty: it was not."""
+    """Return the topic of a loop; word : why the map does not use it, or empty."""
     return (FALSE_LOOP_TOPIC if loop.struck else REJECTED_LOOP_TOPIC if word in _REFUSED else
             TRUSTED_LOOP_TOPIC if loop.trusted else LOOP_TOPIC)
 
@@ -152,8 +153,8 @@ def _note(graph: FactorGraph, stamps: list[int]) -> dict[str, str]:
     """
     Return the note on a graph that goes into the metadata of its bag.
 
-    A graph may have loops that are equal in all, steps longer than a robot's, years between its
-    keyframes, and variances of no measurement: each message is meant then, and the note says so.
+    A graph may have equal loops, longer steps than robots take, years between its keyframes, and
+    unusual variances. The note then says that each message is to be taken as it is.
     """
     factors, steps, loops = graph.between, steps_of(graph), loops_of(graph)
     equal = np.concatenate((factors.pairs[loops], factors.measurement[loops]), axis=1)
@@ -203,21 +204,21 @@ def _backward(record: GraphRecord) -> Mask:
 
 
 def _turned_note(graph: FactorGraph, backward: Mask) -> dict[str, str]:
-    """Return which steps and which loops, in the order of the messages, were turned."""
+    """Return the numbers of the odometry steps and loops that were inverted, for the note."""
     rows = {TURNED_STEPS: steps_of(graph), TURNED_LOOPS: loops_of(graph)}
     return {name: ' '.join(map(str, np.flatnonzero(backward[of]).tolist()))
             for name, of in rows.items() if backward[of].any()}
 
 
 def _left_out_note(graph: FactorGraph, words: np.ndarray) -> dict[str, str]:
-    """Return which steps and which loops, in the order of the messages, were left out."""
+    """Return the numbers of the odometry steps and loops that are left out, for the note."""
     return {name: ' '.join(map(str, np.flatnonzero(said).tolist()))
             for word, name in LEFT_OUT.items()
             if (said := words[(steps_of if word == SLIP else loops_of)(graph)] == word).any()}
 
 
 def _stamps(record: GraphRecord) -> list[int]:
-    """Return the stamps [ns], each after the one before."""
+    """Return the stamps [ns]; raise unless each is after the one before."""
     stamps = record.times
     if not len(stamps):
         raise GraphError('the graph has no vertices; expected one or more')

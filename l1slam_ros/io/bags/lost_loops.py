@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Loops of a bag that did not get into its graph: most were refused, or nobody read their topic.
+Warnings about loops of a bag that are not in its graph: refused, or on a topic that was not read.
 
-A map without its loops is no success, and whoever left them out has to hear where they are.
+A map without its loops is not a success, so the sentence names the topic of the loops.
 """
 
 import re
@@ -22,9 +22,9 @@ from l1slam_ros.io.bags.topics import ABSOLUTE_TOPIC, FALSE_LOOP_TOPIC, ODOMETRY
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.messages.front_ends import LOOP_TYPES
 
-# The frame of a loop, near enough: what of it is wrong is told by who reads the topic.
+# Roughly the frame of a loop; what is wrong with it is reported when the topic is read.
 _LOOP_FRAME = re.compile(r'.+@[0-9]+\.[0-9]+')
-# So many messages of a topic are looked at to tell what it is for.
+# Number of messages of a topic that are searched for such a frame.
 _FIRST = 100
 
 
@@ -34,7 +34,7 @@ class LoopCount:
 
     Attributes
     ----------
-    came, refused : how many came on each topic, and how many of these cannot be used
+    came, refused : topic -> number of loops, and of those that cannot be used
 
     """
 
@@ -43,12 +43,12 @@ class LoopCount:
         self._first = ''
 
     def refuse(self, topic: str, reason: str) -> None:
-        """Count one that cannot be used."""
+        """Count a loop that cannot be used."""
         self.refused[topic] += 1
         self._first = self._first or reason
 
     def only(self, topic: str) -> None:
-        """Forget what came on other topics."""
+        """Drop the counts of other topics."""
         for count in self.came, self.refused:
             for other in count.keys() - {topic}:
                 del count[other]
@@ -56,11 +56,11 @@ class LoopCount:
     def sentences(self, lost: int, path: Path, read: Collection[str],
                   odometry: str) -> Iterator[str]:
         """
-        Yield a sentence where most loops were lost, and one where some are there that nobody read.
+        Yield a sentence if most loops were lost, and one if there are loops that were not read.
 
         Parameters
         ----------
-        lost : how many are not in the graph for other reasons than those that were counted
+        lost : number of loops that are not in the graph for reasons that were not counted here
         path : the bag
         read : the topics that were read
         odometry : that of the odometry
@@ -81,7 +81,7 @@ class LoopCount:
 
 def _unread(path: Path, read: Collection[str],
             odometry: str) -> list[tuple[TopicSummary, str]]:
-    """Return the topics of loops that were not read, and by which options they would be."""
+    """Return the topics with loops that were not read, and the options that would read them."""
     topics = bag_summary(path).topics
     others = [topic for topic in topics if topic.name not in read and topic.count]
     shaped = _with_loop_frames(path, {
@@ -94,18 +94,18 @@ def _unread(path: Path, read: Collection[str],
             nearest = max([odometry, *sources], key=lambda name: _shared(name, topic.name))
             beside = f' --odom-topic {nearest}' if nearest != odometry else ''
             found.append((topic, f'--loop-topic {topic.name}{beside}'))
-    # Those of the robot whose odometry was read come first.
+    # First the loops of the robot whose odometry was read.
     return sorted(found, key=lambda one: -_shared(odometry, one[0].name))
 
 
 def _shared(name: str, other: str) -> int:
-    """Return how many leading parts two topics share: of one robot they have its name."""
+    """Return the number of leading parts that two topics share, such as the name of a robot."""
     parts = list(zip(name.split('/')[:-1], other.split('/')[:-1], strict=False))
     return next((k for k, (a, b) in enumerate(parts) if a != b), len(parts))
 
 
 def _with_loop_frames(path: Path, left: dict[str, int]) -> set[str]:
-    """Return which topics have a loop among the first messages; left : so many of each."""
+    """Return the topics with a loop among the first messages; left : number to read of each."""
     seen, shaped = Counter[str](), set[str]()
     for message in read_messages(path, left.keys(), lambda _: None) if left else ():
         # The bag may define the type otherwise.

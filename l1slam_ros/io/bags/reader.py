@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Bags in: rosbag2 directories, bare `.mcap` and `.db3` files, `.bag` files of ROS 1.
+Reading bags: rosbag2 directories, bare `.mcap` and `.db3` files, `.bag` files of ROS 1.
 
-The bag library reads them while it can; where it gives up, `salvage` goes on. The libraries take
-their time to import, so who may do without a bag imports this module only where it meets one.
+The bag library reads them; if it fails, `salvage` reads what is before the damage. The libraries
+are slow to import, so other modules import this one only when there is a bag.
 """
 
 import math
@@ -42,10 +42,10 @@ from l1slam_ros.io.bags.topics import BAG_SUFFIXES
 from l1slam_ros.io.bags.writer import NOTE_KEY
 from l1slam_ros.io.bounded import read_yaml
 
-# What types of ROS 1 are made of, as ROS 2 has it.
+# Types that ROS 1 messages contain, in their ROS 2 form.
 _BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
 _TO_ITS_END = 'expected a bag that can be read to its end'
-# Told of damage, in one sentence, when all that is before it was read.
+# Called with one sentence about the damage, after everything before it was read.
 OnDamage = Callable[[str], None]
 
 
@@ -55,7 +55,7 @@ def _refuse(damage: str) -> None:
 
 @dataclass(frozen=True)
 class TopicSummary:
-    """A topic, its type and how many messages it has."""
+    """A topic, its type and its number of messages."""
 
     name: str
     msgtype: str
@@ -85,7 +85,7 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
     ----------
     path : a rosbag2 directory, .mcap, .db3 or .bag
     topics : only these, as far as the bag has them; None: all
-    on_damage : told, in the end, why only a part could be read; else that is an error
+    on_damage : called in the end with the reason why only a part could be read; by default raises
 
     Raises
     ------
@@ -96,7 +96,7 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
     for raw, types in _messages(path, topics, None, None, on_damage):
         try:
             message = types.deserialize_cdr(raw.data, raw.msgtype)
-        except Exception:  # bytes that are no message make the library raise anything
+        except Exception:  # malformed messages make the library raise any error
             undecodable += 1
             continue
         count += 1
@@ -110,7 +110,7 @@ def read_raw(path: str | os.PathLike[str], topics: Collection[str] | None = None
              on_damage: OnDamage = _refuse, *, start: int | None = None,
              stop: int | None = None) -> Iterator[BagMessage]:
     """
-    Yield the messages of a bag in order of time, as serialised; arguments as `read_messages`.
+    Yield the serialised messages of a bag in order of time; see `read_messages`.
 
     start, stop : only messages from start [ns] on and before stop [ns].
     """
@@ -145,7 +145,7 @@ def bag_summary(path: str | os.PathLike[str]) -> BagSummary:
 
 def read_note(path: str | os.PathLike[str]) -> dict[str, str]:
     """
-    Return what this package noted in a bag, {} where it noted nothing or nothing can be read.
+    Return the note of this package in a bag; {} if there is none or it cannot be read.
 
     `keyframes: every`: each odometry message is a keyframe; `covariance: increment`: its
     covariance is that of the motion since the message before.
@@ -159,7 +159,7 @@ def read_note(path: str | os.PathLike[str]) -> dict[str, str]:
     for file in [bag] if bag.is_file() else [bag, *storage_files(bag)]:
         try:
             note = {str(key): str(value) for key, value in _note_in(file).items()}
-        except Exception:  # damaged files, and notes that are none, make anything raise
+        except Exception:  # damaged files and malformed notes raise any error
             continue
         if note:
             return note
@@ -197,12 +197,12 @@ def _bag_path(path: str | os.PathLike[str]) -> Path:
 
 def _messages(path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
               stop: int | None, on_damage: OnDamage) -> Iterator[tuple[BagMessage, Any]]:
-    """Yield the messages of a bag, each with the types to decode it by."""
+    """Yield the messages of a bag, each with the types for decoding it."""
     bag = _bag_path(path)
     count = 0
     last = -math.inf
     try:
-        # All of one time or none: the library may have another order than the file.
+        # All messages of one time or none: the library may order them differently from the file.
         for time, group in groupby(_by_library(bag, topics, start, stop), lambda m: m[0].time):
             messages = list(group)
             count = count + len(messages)
@@ -226,21 +226,21 @@ def _by_library(bag: Path, topics: Collection[str] | None, start: int | None,
         types = reader.typestore if reader.is2 else _ros1_types(reader.typestore.fielddefs)
         connections = [c for c in reader.connections if topics is None or c.topic in topics]
         missing = sum(c.msgcount for c in connections)
-        # No connection would mean all of them to the library.
+        # For the library an empty list means all connections.
         for c, time, data in reader.messages(connections, start, stop) if connections else ():
             missing -= 1
             cdr = bytes(data if reader.is2 else types.ros1_to_cdr(data, c.msgtype))
             yield BagMessage(c.topic, c.msgtype, time, cdr), types
-        # Within a chunk the library stops at a damaged record without a word.
+        # The library stops silently at a damaged record within a chunk.
         if missing > 0 and start is None and stop is None:
             raise LookupError(f'{missing:,} messages are missing')
 
 
 def _ros1_types(fields: Mapping[str, Any]) -> Any:
-    """Return the types by which messages of ROS 1 become CDR, and are decoded from that."""
+    """Return the types for converting messages of ROS 1 to CDR and decoding them."""
     jazzy = get_typestore(Stores.ROS2_JAZZY).fielddefs
     types = get_typestore(Stores.EMPTY)
-    # In ROS 1 a header has one field more, which the library's conversion leaves out.
+    # The header of ROS 1 has one more field, which the library's conversion drops.
     types.register({**fields, **{name: jazzy[name] for name in _BASIC}})
     return types
 
@@ -251,7 +251,7 @@ def _reader(bag: Path) -> Iterator[Any]:
     if bag.is_dir():
         require_shallow(bag / METADATA)
         if str(directory_metadata(bag).get('compression_mode') or 'none').lower() != 'none':
-            raise LookupError('compressed by file or message')  # the library has no bounds there
+            raise LookupError('compressed by file or message')  # the library does not limit that
     for file in storage_files(bag) if bag.is_dir() else [bag]:
         if file.suffix == '.mcap' and not is_indexed(file):
             raise LookupError(f'{file.name} has no sound index')
@@ -260,7 +260,7 @@ def _reader(bag: Path) -> Iterator[Any]:
         if file.suffix == '.db3':
             with opened(file) as database:
                 require_tables(database)
-    # The definitions in the bag come first; sqlite bags of older distributions have none.
+    # Used if the bag has no definitions, as sqlite bags of older distributions.
     typestore = get_typestore(Stores.ROS2_JAZZY)
     with AnyReader([bag], default_typestore=typestore) as reader:
         yield reader

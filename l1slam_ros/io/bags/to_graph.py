@@ -7,12 +7,12 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A bag -> a graph, grown by the code that the node grows with: live and offline see one graph.
+Building a graph from a bag with the code of the node, so that live and offline graphs are equal.
 
-Where the topic of the loops has pose graphs of another front end, their loops are taken; where
-that of the odometry has, the graph as a whole.
+If the topic of the loops has pose graphs of another front end, their loops are taken; if that of
+the odometry has, the whole graph.
 
-And the true poses that it has on a topic, stamped by their headers.
+This module also reads true poses from a topic.
 """
 
 from collections import Counter
@@ -63,7 +63,7 @@ from l1slam_ros.io.messages.front_ends import LOOP_TYPES
 from l1slam_ros.io.trajectory import Reference
 
 _EVERY = KeyframeOptions(0.0, 0.0, 0.0)
-# What a topic of true poses may be of.
+# Possible types of a topic with true poses.
 _POSES = ('geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovarianceStamped',
           'geometry_msgs/msg/TransformStamped', 'nav_msgs/msg/Odometry')
 
@@ -71,19 +71,19 @@ _POSES = ('geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovariance
 def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topics,
                    dimension: int = 2) -> GraphRecord:
     """
-    Grow a graph from the messages of a bag, damaged or not.
+    Build a graph from the messages of a bag, damaged or not.
 
     Parameters
     ----------
     path : a rosbag2 directory, .mcap, .db3 or .bag
-    options : what makes keyframes of messages; None: the node's defaults. Where the bag's note
-        says it otherwise, defaults give way
-    topics : where to look
-    dimension : of the world; a bag that notes 3 is in space anyway
+    options : how messages become keyframes; None: the node's defaults. A note in the bag replaces
+        values that are defaults
+    topics : of the odometry and the loops
+    dimension : of the poses, 2 or 3; a note in the bag that says 3 comes first
 
     Raises
     ------
-    FileError : the bag cannot be read, there is no graph in it, or not the topics asked for.
+    FileError : the bag cannot be read, holds no graph, or does not have the topics.
 
     """
     note = read_note(path)
@@ -128,7 +128,7 @@ class _Growing:
         self.seen: set[str] = set()
 
     def take(self, message: BagMessage) -> None:
-        """Use a message, or note why not."""
+        """Add a message to the graph, or count it as refused with the reason."""
         topic = message.topic
         expected = self._types.get(message.topic, message.msgtype)
         self.seen.add(topic)
@@ -145,14 +145,15 @@ class _Growing:
             else:
                 is_loop = topic in (self._topics.loops, REJECTED_LOOP_TOPIC)
                 name = LOOP_TOPIC if is_loop else topic
-                self._builder.add_loop(conversion.LOOPS[name.removeprefix('/')](
-                    message.data, self._builder.base_frame.name, self._map_frame))
-                if topic == ABSOLUTE_TOPIC:  # the map is the frame that the first one names
+                self._builder.add_loop(conversion.loop_in(
+                    name.removeprefix('/'), message.data, self._builder.base_frame.name,
+                    self._map_frame))
+                if topic == ABSOLUTE_TOPIC:  # the first absolute pose names the map frame
                     self._map_frame = message.data.header.frame_id.removeprefix('/')
         except MessageError as error:
             self._refuse(topic, error.cause, str(error))
         except (AttributeError, TypeError, ValueError):
-            # The bag defines the type otherwise: it is damaged there, or of another ROS.
+            # The bag has another definition of the type: it is damaged, or of another ROS.
             self._refuse(topic, 'fields',
                          f'a message on {topic}; expected the fields of {expected}')
 
@@ -170,23 +171,23 @@ class _Growing:
         for found in self._graph.take(message, topic):
             self._loops.came[self._foreign.main] += 1
             if not isinstance(found, LoopClosure):
-                # Of the whole graph no keyframe's time need be known, and it may be of several.
+                # A whole graph needs no stamps, and may have several robots.
                 if not (self._is_graph and found.cause in ('keyframe', 'robot')):
                     self._refuse(self._foreign.main, found.cause, str(found))
             elif not self._is_graph:
                 self._builder.add_loop(found)
 
     def lost(self, path: Path) -> list[str]:
-        """Return sentences on loops of the bag that are not in the graph, if these are most."""
+        """Return sentences on the loops that are not in the graph, if these are most."""
         loops, odometry = self._builder.loops, self._topics.odometry
-        if self._is_graph:  # nothing of another topic is in it
+        if self._is_graph:  # it has nothing from other topics
             self._loops.only(odometry)
             return list(self._loops.sentences(0, path, {odometry}, odometry))
         late = sum(not (one.loop.struck or one.loop.is_absolute) for one in loops.waiting.all())
         return list(self._loops.sentences(loops.lost + late, path, self._types, odometry))
 
     def record(self, damage: str) -> GraphRecord:
-        """Return the graph that has grown; damage : of the bag."""
+        """Return the graph; damage : a sentence on the bag, or empty."""
         builder = self._builder
         if self._is_graph and self._graph is not None:
             graph, ids = self._graph.graph(builder.graph.manifold, builder.options)
@@ -206,7 +207,7 @@ class _Growing:
 
 def read_truth_topic(path: Path, topic: str, manifold: Manifold = se2) -> Reference:
     """
-    Return the true poses on a topic of a bag, in order of their stamps; of one stamp the first.
+    Return the true poses on a topic by ascending stamps; of equal stamps the first pose.
 
     Raises
     ------
@@ -236,7 +237,7 @@ def read_truth_topic(path: Path, topic: str, manifold: Manifold = se2) -> Refere
 
 
 def _noted_options(options: GraphBuilderOptions, note: dict[str, str]) -> GraphBuilderOptions:
-    """Return the options with what the note says in the place of defaults."""
+    """Return the options with their defaults replaced by what the note says."""
     every, source = GRAPH_NOTE['keyframes'], GRAPH_NOTE['covariance']
     if note.get('keyframes') == every and options.keyframe == KeyframeOptions():
         options = replace(options, keyframe=_EVERY)
@@ -246,7 +247,7 @@ def _noted_options(options: GraphBuilderOptions, note: dict[str, str]) -> GraphB
 
 
 def _noted_turns(graph: FactorGraph, note: dict[str, str]) -> Mask:
-    """Return which factors were turned when they became messages, (m,) bool."""
+    """Return which factors were inverted when the bag was written, (m,) bool."""
     odometry = graph.between.is_odometry
     turns = np.zeros(len(odometry), bool)
     for name, kind in (TURNED_STEPS, odometry), (TURNED_LOOPS, ~odometry):
@@ -255,7 +256,7 @@ def _noted_turns(graph: FactorGraph, note: dict[str, str]) -> Mask:
 
 
 def _noted_left_out(graph: FactorGraph, note: dict[str, str]) -> np.ndarray:
-    """Return why a map was made without each factor, (m,) of `left_out`."""
+    """Return for each factor why the map does not use it, (m,) of `left_out`."""
     odometry = graph.between.is_odometry
     words = nothing_left_out(len(odometry))
     for word, name in LEFT_OUT.items():
@@ -265,13 +266,13 @@ def _noted_left_out(graph: FactorGraph, note: dict[str, str]) -> np.ndarray:
 
 
 def _noted_rows(rows: Indices, note: dict[str, str], name: str) -> Indices:
-    """Return the rows whose numbers are in a note; a damaged bag may lack the last ones."""
+    """Return the rows whose numbers are in a note; those a damaged bag has lost are skipped."""
     numbers = [int(word) for word in note.get(name, '').split() if word.isdecimal()]
     return rows[[number for number in numbers if number < len(rows)]]
 
 
 def _alternatives(path: Path, topic: str, *msgtypes: str) -> list[str]:
-    """Name the other topics of a bag with messages of some types; empty where there are none."""
+    """Return a clause for each of some types that names the other topics with it."""
     others = [(t.msgtype, t.name) for t in bag_summary(path).topics if t.name != topic]
     return [f'{msgtype} is on {", ".join(name for found, name in others if found == msgtype)}'
             for msgtype in msgtypes if msgtype in dict(others)]

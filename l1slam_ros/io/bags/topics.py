@@ -15,7 +15,7 @@ ODOMETRY_TOPIC = '/odom'
 LOOP_TOPIC = '/loop_closures'
 TRUSTED_LOOP_TOPIC = '/trusted_loop_closures'
 FALSE_LOOP_TOPIC = '/false_loop_closures'
-# Of loops that were not believed: no program but this one listens.
+# Loops that the map does not use; only this program reads them.
 REJECTED_LOOP_TOPIC = '/rejected_loop_closures'
 ABSOLUTE_TOPIC = '/absolute_poses'
 TRUTH_TOPIC = '/ground_truth'

@@ -7,11 +7,11 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Bags out: rosbag2 directories (mcap) that `ros2 bag play`, rosbags, Foxglove and mcap tools read.
+Writing rosbag2 directories (mcap) that `ros2 bag play`, rosbags, Foxglove and mcap tools read.
 
-The mcap library writes the file, in small chunks with checksums: of a file that is cut or gets a
-wrong bit later on, little is lost, and the loss is seen. What rosbag2 wants besides is made here:
-metadata.yaml of its version 9, and a copy of it in the file.
+The mcap library writes the file in small chunks with checksums, so that little is lost, and the
+loss is noticed, if the file is cut or damaged later. This module adds what rosbag2 needs:
+metadata.yaml, version 9, and a copy of it in the file.
 """
 
 import os
@@ -30,12 +30,12 @@ from l1slam_ros.io.bags.damaged.salvage import METADATA
 from l1slam_ros.io.files import new_folder_beside, reported, sync_folder
 
 NOTE_KEY = 'l1slam'
-# What recorders leave in a bag's directory besides metadata.yaml.
+# Suffixes of the other files in the directory of a bag.
 _BAG_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', '.zstd')
 _CHUNK = 16 * 1024  # [bytes] before compression: about 20 odometry messages
 _LIBRARY = 'l1slam_ros'
 _DISTRIBUTION = 'jazzy'
-# As rosbag2 writes them: no deadline is 2^63 - 1 ns, and so is the start of an empty bag.
+# As in rosbag2: 2^63 - 1 ns means no deadline, and is the start of an empty bag.
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 _NEVER = 2**63 - 1
 _QOS = {'history': 'keep_last', 'depth': 1000, 'reliability': 'reliable', 'durability': 'volatile',
@@ -73,7 +73,7 @@ class BagWriter:
         self._times = (min(self._times[0], time), max(self._times[1], time))
 
     def metadata(self, file: str, note: dict[str, str]) -> dict[str, Any]:
-        """Return what metadata.yaml is to say of the file, and of a note in it."""
+        """Return the content of metadata.yaml for the file and a note."""
         start, stop = self._times
         extent = {'duration': {'nanoseconds': max(stop - start, 0)},
                   'starting_time': {'nanoseconds_since_epoch': start},
@@ -96,7 +96,7 @@ class BagWriter:
 @contextmanager
 def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagWriter]:
     """
-    Yield the writer of a bag, which takes its place when the block succeeds.
+    Yield the writer of a new bag, which is put in place when the block succeeds.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
         with file.open('xb') as stream:
             writer = Writer(stream, chunk_size=_CHUNK)
             writer.start('ros2', _LIBRARY)
-            # First of all: what is read of a file that is cut must not lose its meaning.
+            # The note comes first, so that it is not lost if the file is cut.
             if note:
                 writer.add_metadata(NOTE_KEY, note)
             bag = BagWriter(writer, get_typestore(Stores.ROS2_JAZZY))
@@ -127,7 +127,7 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
         (made / METADATA).write_text(_yaml(document) + '\n', 'utf-8')
 
 
-# Writes out twice whatever occurs in a document twice.
+# Writes no aliases for values that occur twice.
 _DUMPER = type('_Dumper', (yaml.SafeDumper,), {'ignore_aliases': lambda self, data: True})
 
 
@@ -137,7 +137,7 @@ def _yaml(document: Any, in_one_line: bool = False) -> str:
 
 
 def refuse_other_than_bag(target: Path) -> None:
-    """Refuse to replace what is there, unless it is a bag and nothing else."""
+    """Refuse to replace what exists at `target`, unless it is a bag and nothing else."""
     if not os.path.lexists(target):
         return
     if not (target / METADATA).is_file():
@@ -155,7 +155,7 @@ def _replacing_directory(target: Path) -> Iterator[Path]:
     with reported(target):
         refuse_other_than_bag(target)
         with new_folder_beside(target) as scratch:
-            # The bag is made under its own name: that of the file inside repeats it.
+            # Under its final name, which the file inside repeats.
             made = scratch / target.name
             yield made
             for file in made.iterdir():
@@ -167,7 +167,7 @@ def _replacing_directory(target: Path) -> Iterator[Path]:
 
 
 def _swap(made: Path, target: Path, former: Path) -> None:
-    """Put `made` in the place of `target`, and what was there, if anything, into `former`."""
+    """Move what is at `target`, if anything, to `former`, and `made` to `target`."""
     replaces = os.path.lexists(target)
     if replaces:
         os.rename(target, former)

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Vertices of a graph file that only fix it in the world: they are no poses of the robot."""
+"""Vertices of a graph file that only fix the graph in the world; they are not poses of a robot."""
 
 import numpy as np
 

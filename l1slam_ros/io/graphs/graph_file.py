@@ -7,9 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Pose graphs as text: g2o (`.g2o`) and TORO (`.graph`) read, g2o written, by one table, `tags`.
+Reading pose graphs in g2o (`.g2o`) and TORO (`.graph`) format, and writing g2o; see `tags`.
 
-Stamps and trust in loops, which neither format knows: see `side_files`, and `remarks`.
+Neither format has a place for stamps and for loops that a person vouched for or struck out: see
+`side_files`, and for saved maps `remarks`.
 """
 
 import os
@@ -67,18 +68,19 @@ from l1slam_ros.io.remarks import Remarks
 @dataclass(frozen=True)
 class GraphRecord:
     """
-    A graph and what its file says besides.
+    A graph together with what else its file holds.
 
-    graph : the factors, in the order of the file; poses : (n, p) the stored start, None when
-    the file has none; ids : (n,) vertex ids, ascending: keyframe k is vertex ids[k];
-    stamps : (n,) [ns] or None; skipped : a sentence on each kind of line that was not used, or
-    not as it stands;
-    damage : a sentence where only a part of the input could be read, else empty;
-    rotation_information : what the rotation block in a g2o file of it is of, of `names`;
-    remarks : of a saved map; left_out : (m,) why a map was made without each factor, of
-    `left_out`, or empty; comments : lines of others, each with how many factors stand before it;
-    drift : see `Judgement`, of the map: its odometry is to be written corrected; log : what a log
-    of several robots says besides.
+    graph : the factors, in the order of the file; poses : (n, p) the stored poses, or None;
+    ids : (n,) vertex ids, ascending: keyframe k is vertex ids[k]; stamps : (n,) [ns] or None;
+    skipped : a sentence for each kind of line that was not used, or was changed;
+    damage : a sentence if only a part of the input could be read, else empty;
+    rotation_information : whether the rotation block of the information in a 3D g2o file is that
+    of the quaternion's vector part or of the angle, of `names`;
+    remarks : the state of a saved map; left_out : (m,) for each factor why the map does not use
+    it, a word of `left_out`, or empty; comments : comment lines of other programs, each with the
+    number of factors before it;
+    drift : of the odometry of the map [rad/m], see `Judgement`: corrected odometry is written;
+    log : further content of a log of several robots.
     """
 
     graph: FactorGraph
@@ -103,14 +105,14 @@ class GraphRecord:
 def read_graph_file(path: str | os.PathLike[str],
                     rotation_information: str = QUATERNION) -> GraphRecord:
     """
-    Read a g2o or TORO file, and in it or beside it the stamps and what a person said of loops.
+    Read a g2o or TORO file, with the stamps and the vouched-for and struck-out loops beside it.
 
-    Vertices may stand anywhere and in any order, or not at all: then they are those the edges
-    name, and `poses` is None. Whether the graph is connected is not looked at.
+    Vertices may be in any order. Without vertex lines, the vertices are those of the edges, and
+    `poses` is None. The graph need not be connected.
 
     Raises
     ------
-    FileError : naming the line, when the file is no such graph or those beside it are of another.
+    FileError : naming the line, if the file is malformed, or a file beside it does not match it.
 
     """
     record, beyond = read_one_of_several(path, rotation_information)
@@ -122,11 +124,11 @@ def read_graph_file(path: str | os.PathLike[str],
 def read_one_of_several(path: str | os.PathLike[str],
                         rotation_information: str = QUATERNION) -> tuple[GraphRecord, Rows]:
     """
-    Read, as `read_graph_file`, one file of several, and its edges to vertices that it has not.
+    Read a graph as `read_graph_file` does, and its edges to vertices of other files.
 
     Raises
     ------
-    FileError : naming the line, when the file is no such graph or those beside it are of another.
+    FileError : naming the line, if the file is malformed, or a file beside it does not match it.
 
     """
     lines = lines_by_tag(path)
@@ -188,20 +190,21 @@ def read_vertices(path: str | os.PathLike[str],
 
 def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
     """
-    Write a graph as g2o with its own ids, every number such that it reads back the same.
+    Write a graph as g2o, with its own ids and with numbers that are read back exactly.
 
-    Factors that were left out are comments, see `left_out`. Stamps, trusted and struck-out loops,
-    if any, go to side files; those of a former graph of this name are removed with that graph.
+    Factors that were left out are written as comments, see `left_out`. Stamps, trusted and
+    struck-out loops are written to side files; side files of a previous graph of this name are
+    removed.
 
     Raises
     ------
-    FileError : the file cannot be written, or a number is none that can be read.
+    FileError : the file cannot be written, or holds a number too large to be read back.
 
     """
     path = Path(path)
     with replacing(path) as temporary:
         put_lines(temporary, [*graph_lines(path, record), MARK])
-        # Before the graph takes its place: it must never meet the stamps or the trust of another.
+        # The side files first: a graph must never be read with the side files of another graph.
         write_beside(path, record.ids, record.stamps, record.graph.between)
 
 
@@ -234,7 +237,7 @@ def _index(path: object, ids: Indices, rows: Rows) -> Indices:
 
 
 def roots_of(path: object, rows: Rows) -> Array:
-    """Return the square roots of the information, (m, d, d); each must have one."""
+    """Return the square roots of the information, (m, d, d); raise if a matrix has none."""
     def works(part: slice) -> bool:
         try:
             square_root_information(rows.scaled[part])
@@ -254,7 +257,7 @@ def roots_of(path: object, rows: Rows) -> Array:
 
 def _skipped(groups: dict[str, TextLines], ids: Indices,
              anchors: Indices) -> tuple[str, ...]:
-    """Return a sentence on each tag that is known and not used, and on anchors."""
+    """Return a sentence for each kind of line that is not used."""
     sentences = [f'vertex {anchor} and its edge are not used: it is an anchor, and the first '
                  f'vertex, {ids[0]}, is the one held fixed' for anchor in anchors.tolist()]
     fixed = [name for name in fixed_in(groups) if name not in anchors.astype(str)]
@@ -301,7 +304,7 @@ def _factor_lines(path: Path, record: GraphRecord, graph: FactorGraph) -> np.nda
 
 
 def left_out_words(record: GraphRecord) -> np.ndarray:
-    """Return why each factor is left out, (m,); what a person struck out now is, too."""
+    """Return for each factor why it is left out, (m,), loops struck out since included."""
     factors = record.graph.between
     words = nothing_left_out(len(factors)) if record.left_out is None else record.left_out.copy()
     words[words == STRUCK] = ''
@@ -311,7 +314,7 @@ def left_out_words(record: GraphRecord) -> np.ndarray:
 
 def _among(comments: tuple[tuple[int, str], ...], head: list[str],
            lines: list[str]) -> list[str]:
-    """Return head and lines with each comment behind as many of the lines as it was."""
+    """Return head and lines with each comment at its place: behind as many lines as before."""
     texts: list[str] = [text for before, text in comments if before == 0]
     texts += head
     done = 0
@@ -323,7 +326,7 @@ def _among(comments: tuple[tuple[int, str], ...], head: list[str],
 
 
 def _kinds(graph: FactorGraph) -> np.ndarray:
-    """Return how each factor is to be written, (m,) of `FACTORS`."""
+    """Return the kind of line of each factor, (m,), of `FACTORS`."""
     factors, rest = graph.between, graph.manifold.identity(1)
     size = graph.manifold.positions(rest).shape[1]
     is_position = ((factors.measurement[:, size:] == rest[:, size:]).all(axis=1)

@@ -7,17 +7,17 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Factors that a map was made without: comments in its file, which this program reads as factors.
+Factors that a map does not use: comments in its file, which this program reads as factors again.
 
-    # rejected EDGE_SE2 ...   a loop or an absolute pose that was not believed
-    # suspect EDGE_SE2 ...    one that fits, but could as well be chance
+    # rejected EDGE_SE2 ...   a loop or an absolute pose that was rejected
+    # suspect EDGE_SE2 ...    a loop that nothing confirmed
     # slip EDGE_SE2 ...       odometry that was left out
     # struck EDGE_SE2 ...     a loop that a person struck out
-    # measured EDGE_SE2 ...   odometry as it was measured, where the map is made of corrected one
+    # measured EDGE_SE2 ...   the measured odometry, if the map uses corrected odometry
 
-So whoever optimises the graph in the file gets the map in it. They stand behind all edges, each
-with its number among the factors: GTSAM reads no edge behind a comment. Of a file that this
-program did not write comments are comments.
+So another program that optimises the graph in the file gets the same map. These comments are
+behind all edges, each with its number among the factors, because GTSAM reads no edge behind a
+comment. In files of other programs all comments are ordinary comments.
 """
 
 import re
@@ -42,12 +42,12 @@ _COMMENT = re.compile(f'# ({REJECTED}|{SUSPECT}|{SLIP}|{STRUCK}|{MEASURED}) '
 
 
 def nothing_left_out(count: int) -> np.ndarray:
-    """Return an empty word for each of `count` factors: none of them is left out."""
+    """Return an empty word for each of `count` factors: all are used."""
     return np.full(count, '', object)
 
 
 def left_out_by(judgement: Judgement | None, factors: BetweenFactors) -> np.ndarray:
-    """Return for each factor why a map was made without it, (m,) of the words above, or empty."""
+    """Return for each factor why the map does not use it, (m,): a word from above, or empty."""
     words = nothing_left_out(len(factors))
     if judgement is not None:
         judged = words[:len(judgement.accepted)]  # a view: later factors are not judged yet
@@ -59,7 +59,7 @@ def left_out_by(judgement: Judgement | None, factors: BetweenFactors) -> np.ndar
 
 
 def left_out_of(inliers: Mask, factors: BetweenFactors) -> np.ndarray:
-    """Return these words where only (m,) bool is known, which factors were believed."""
+    """Return these words, (m,), if only the accepted factors are known, (m,) bool."""
     words = np.where(inliers, '', np.where(factors.is_odometry, SLIP, REJECTED)).astype(object)
     words[factors.struck] = STRUCK
     return words

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The file of a running map: when it is saved, and never over a file of somebody else."""
+"""The file of a running map: when it is saved, without ever replacing a file of other programs."""
 
 import filecmp
 import os
@@ -25,26 +25,26 @@ from l1slam_ros.io.formats import named
 from l1slam_ros.io.graphs.saved_map import before_of, is_map, keep_as, load_map, save_map
 from l1slam_ros.io.node_options import NodeOptions
 
-# An autosave begins after such a part of its period. Whoever pulls the plug just before it is done
-# loses what came since the one before began: so it has as long again to come to its end.
+# An autosave begins after this part of its period, so that it has the rest of it to finish: then a
+# power cut loses at most one period.
 _PART = 0.5
-# [bytes] Enough of the end of a file to tell a map from another: its checksum is in it.
+# [bytes] of the end of a file, which tell one map from another: the checksum is in them.
 _END = 128
 
 
 class MapFile:
     """
-    Saves and loads the map of a back end; several threads may call, one at a time is served.
+    Saves and loads the map of a back end; calls from several threads are carried out in turn.
 
     Parameters
     ----------
-    backend : whose map
-    options : returns `save_path` and `autosave_period` as they are now
-    warn : told what a person should know
+    backend : the back end
+    options : returns the current options, of which `save_path` and `autosave_period` are used
+    warn : called with a sentence for the log
 
     Attributes
     ----------
-    is_saving : whether a save is under way
+    is_saving : whether the map is being saved now
 
     """
 
@@ -55,20 +55,20 @@ class MapFile:
         self._warn = warn
         self.is_saving = False
         self._one = threading.Lock()
-        # Names of robots by their numbers, behind those of the node the ones of a loaded map.
+        # Names of the robots by number: those of the node, then further ones of a loaded map.
         self._robots = options().names
-        # When the last save began, or the node; and whether there was one.
+        # When the last save, or else the node, began; and whether there was a save.
         self._began = time.monotonic()
         self._tried = False
-        # Where the map was saved or loaded last, and its revision then.
+        # Path and revision of the map when it was last saved or loaded.
         self._known = _absolute(options().save_path), backend.revisions.now
-        # The file that we wrote or loaded, its end, and what names the graph whose map it holds;
-        # and of the one before it the name and the end.
+        # Of the file that this node wrote or loaded: path, last bytes, and when its graph began.
+        # Of the file before it: path and last bytes.
         self._ours: tuple[object, ...] = ()
         self._ours_before: tuple[object, ...] = ()
 
     def save(self) -> str:
-        """Save the map; return a sentence that says where, and which foreign file was kept."""
+        """Save the map; return a sentence with its path, and the files that were renamed."""
         with self._at_work(), self._backend.calm:
             revision = self._backend.revisions.now
             path = self._path()
@@ -78,9 +78,9 @@ class MapFile:
 
     def autosave(self, taken: Callable[[], None] = lambda: None) -> None:
         """
-        Save the map if it has changed; a file in its place that this node did not write is kept.
+        Save the map if it has changed; keep a file at its path that this node did not write.
 
-        taken : called before it is written: what becomes of the map from then on does not matter
+        taken : called when the map has been copied; it may be changed from then on
         """
         with self._at_work():
             revision = self._backend.revisions.now
@@ -94,7 +94,7 @@ class MapFile:
             self._write(path, saved, revision)
 
     def _keep_others(self, path: Path, saved: SavedMap | None) -> list[str]:
-        """Keep foreign files in the places of a map under other names; return a sentence on it."""
+        """Rename files that this node did not write; return a sentence for each."""
         if saved is None:
             return []
         sentences = []
@@ -143,15 +143,15 @@ class MapFile:
         with named(path):
             graph = self._backend.restore(saved)
         self._known = path, self._backend.revisions.now
-        # What could not be read may be of use to somebody yet, and a graph that is no saved map is
-        # somebody's own.
+        # A damaged file may still be of use, and a graph that is not a saved map belongs to a
+        # person: neither is replaced.
         self._ours = (path, end, graph) if whole and is_map(path) else ()
         before = before_of(path)
         self._ours_before = (before, _end_of(before)) if is_map(before) else ()
         return sentence, whole
 
     def _by_name(self, saved: SavedMap) -> SavedMap:
-        """Return a loaded map; its robots get the numbers that their names have in this node."""
+        """Return a loaded map, its robots numbered as their names are in this node."""
         own = self._options().names
         named = len(saved.robots)
         names = self._robots = own + tuple(name for name in saved.robots if name not in own)
@@ -159,13 +159,13 @@ class MapFile:
         def number(was: int) -> int:
             return names.index(saved.robots[was]) if was < named else was - named + len(names)
 
-        # What a node without names has saved, is of the first robot.
+        # A map that was saved without names belongs to the first robot.
         if not own or not named:
             return saved
         return replace(saved, builder=saved.builder.renumbered(number))
 
     def load_at_start(self, tell: Callable[[str], object]) -> None:
-        """Load the map if there is one; tell so, or warn where there is a damaged one."""
+        """Load the map if there is one; `tell` what was loaded, or warn of a damaged file."""
         try:
             sentence, well = self._loaded()
         except FileError as error:
@@ -178,8 +178,8 @@ class MapFile:
         Return whether to autosave now.
 
         The first save is due as soon as there is a map: a node that is restarted again and again
-        would otherwise lose its map each time. Where a file that was not loaded stands at the
-        path, the first save waits a period, so that a person can still load it.
+        would otherwise lose its map each time. If the path has a file that was not loaded, the
+        first save waits for a period, so that a person can still load that file.
         """
         due = self._began + _PART * self._options().autosave_period
         return self._is_to_be_saved() and (time.monotonic() >= due or (
@@ -198,7 +198,7 @@ class MapFile:
 
 
 def unusable_path(save_path: str) -> str:
-    """Return what is wrong with a `save_path` where no file can be; else nothing."""
+    """Return a sentence if no file can be written to `save_path`, else an empty one."""
     if not save_path:
         return ''
     path = _absolute(save_path)
@@ -214,7 +214,7 @@ def _absolute(path: str) -> Path:
 
 
 def _end_of(path: Path) -> bytes:
-    """Return the last bytes of a file, empty: there is none. A saved map ends in its checksum."""
+    """Return the last bytes of a file; empty if there is none. A saved map ends in a checksum."""
     if not os.path.isfile(path):
         return b''
     with path.open('rb') as file:
@@ -223,7 +223,7 @@ def _end_of(path: Path) -> bytes:
 
 
 def _kept(path: Path, of: Path) -> list[str]:
-    """Keep a file under the name of its day; return a sentence, none if it is kept already."""
+    """Rename a file after its date; return a sentence, or none if such a copy exists already."""
     name = f'{of.stem}.{_time_of(path)}'
     number = 1
     kept = of.with_name(f'{name}{of.suffix}')
@@ -237,5 +237,5 @@ def _kept(path: Path, of: Path) -> list[str]:
 
 
 def _time_of(path: Path) -> str:
-    """Return when a file was written, as a part of a name."""
+    """Return the time of the last change of a file, as a part of a name."""
     return time.strftime('%Y-%m-%dT%H-%M-%S', time.localtime(path.stat().st_mtime))

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What a log of several robots holds besides its graph; it is written back unchanged."""
+"""The content of a log of several robots besides its graph; it is written back unchanged."""
 
 from dataclasses import dataclass
 

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The lines of a graph file as arrays; each line that is malformed is named."""
+"""The lines of a graph file as arrays; errors name the malformed line."""
 
 import os
 from collections import defaultdict
@@ -31,7 +31,7 @@ from l1slam_ros.io.graphs.left_out import restored
 from l1slam_ros.io.graphs.tags import OFFSET, TAGS, TAGS_LEFT_OUT
 from l1slam_ros.io.remarks import Remarks
 
-# So many lines are named in one sentence.
+# Number of lines that one sentence names.
 _NAMED = 3
 _MATRICES = 'information matrices'
 
@@ -39,11 +39,11 @@ _MATRICES = 'information matrices'
 @dataclass(frozen=True)
 class Rows:
     """
-    The lines of some kinds, in the order of the file.
+    Lines of some kinds, in the order of the file.
 
-    lines : (m,) line numbers; ids : (m, 2), the same twice where a line has but one; alone : (m,)
-    bool, where it has; pose : (m, p); information : (m, d, d) as in the file; units : (m, d) of
-    it, see `Tag.units`.
+    lines : (m,) line numbers; ids : (m, 2) vertex ids, the same id twice for a line with one id;
+    alone : (m,) bool, the lines with one id; pose : (m, p); information : (m, d, d) as in the
+    file; units : (m, d) of the information, see `Tag.units`.
     """
 
     lines: Indices
@@ -74,9 +74,9 @@ class GraphLines:
     """
     The lines of a graph file.
 
-    groups : those of each tag, without the tag, every tag is known; left_out : number -> why a map
-    was made without the factor on it, and its place; remarks : of a saved map; comments : numbers
-    and texts.
+    groups : tag -> its lines, without the tag; all tags are known; left_out : line number -> why
+    the map does not use the factor on this line, and the factor's place; remarks : the state of a
+    saved map; comments : numbers and texts.
     """
 
     groups: dict[str, TextLines]
@@ -86,7 +86,7 @@ class GraphLines:
 
 
 def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
-    """Return the lines of a graph file by their tags."""
+    """Read a graph file; return its lines by their tags."""
     lines, left_out = restored(read_lines(path))
     groups: dict[str, TextLines] = defaultdict(lambda: TextLines([], []))
     for number, text in zip(lines.numbers, lines.texts, strict=True):
@@ -112,7 +112,7 @@ def expected_tags(kind: str) -> str:
 
 
 def manifold_of(path: object, groups: dict[str, TextLines]) -> Manifold:
-    """Return the manifold of the poses of a file; all of them must be on one."""
+    """Return the manifold of the poses of a file; raise if there are two."""
     found = sorted((lines.numbers[0], name) for name, lines in groups.items() if name in TAGS)
     for line, name in found[1:]:
         if TAGS[name].manifold is not TAGS[found[0][1]].manifold:
@@ -181,7 +181,7 @@ def vertices_of(path: object, groups: dict[str, TextLines], manifold: Manifold) 
 
 
 def without_circles(edges: Rows) -> tuple[Rows, list[str]]:
-    """Return the edges but for those from a vertex to itself, and a sentence on these, if any."""
+    """Return the edges without those from a vertex to itself, and a sentence on these, if any."""
     circle = (edges.ids[:, 0] == edges.ids[:, 1]) & ~edges.alone
     if not circle.any():
         return edges, []
@@ -194,9 +194,10 @@ def without_circles(edges: Rows) -> tuple[Rows, list[str]]:
 
 def made_definite(edges: Rows) -> tuple[Rows, list[str]]:
     """
-    Return the edges with information that is positive definite where it can be, and a sentence.
+    Return the edges with positive definite information, and a sentence if some had other.
 
-    See `nearest_definite`, in the units of the residual; there is no sentence where all was.
+    An indefinite matrix is replaced by `nearest_definite`, in the units of the residual; a matrix
+    that cannot be made definite stays.
     """
     place, which = distinct(edges.scaled)
     nearest, least = nearest_definite(edges.scaled[place])

@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The map of a back end as one file, and back: a g2o graph, and all else in its remarks.
+Saving and loading the map of a back end: a g2o graph, with the rest of the state in its remarks.
 
-One rename puts it in its place. The map before stays beside it, as `<path>.1`.
+The new file takes its place by one rename. The previous one stays beside it, as `<path>.1`.
 """
 
 import glob
@@ -61,13 +61,15 @@ def save_map(path: Path, saved: SavedMap | None) -> str:
 
 def load_map(path: Path) -> tuple[SavedMap, str, bool]:
     """
-    Return the map in a file, or the one saved before where the file is damaged or missing.
+    Return the map in a file, or the previous one if that file is damaged or missing.
 
-    Besides: a sentence that says which of the two it is, and whether it is the newer one.
+    Returns
+    -------
+    the map, a sentence that names its file, and whether it is the newer of the two
 
     Raises
     ------
-    FileError : neither is a map.
+    FileError : neither file is a map.
 
     """
     before = before_of(path)
@@ -112,7 +114,7 @@ def is_map(path: Path) -> bool:
 
 
 def before_of(path: Path) -> Path:
-    """Return the name under which the map saved before the one at `path` is kept."""
+    """Return the name of the map that was saved before the one at `path`."""
     return path.with_name(f'{path.name}.1')
 
 
@@ -121,7 +123,7 @@ def _count(saved: SavedMap) -> int:
 
 
 def _keep(path: Path) -> None:
-    """Keep a file as the map before, unless it is damaged and the map before is whole."""
+    """Rename a file to that of the previous map, unless it is damaged and that one is whole."""
     before = before_of(path)
     if os.path.exists(path) and (is_map(path) or not is_map(before)):
         keep_as(path, before)
@@ -135,7 +137,7 @@ def _remove_leftovers(path: Path) -> None:
 
 
 def _left_out(saved: SavedMap) -> np.ndarray:
-    """Return why each factor is left out; loops newer than the judgement are not judged yet."""
+    """Return for each factor why it is left out; loops that are not judged yet are suspect."""
     factors = saved.builder.graph.between
     judgement = saved.judgement
     if not saved.robust or not len(judgement.accepted):
@@ -165,7 +167,7 @@ def _remarks(saved: SavedMap) -> dict[str, Any]:
 
 
 def _of_robots(state: BuilderState) -> dict[str, Any]:
-    """Return, by name, which robot owns what; nothing for a map of the first robot alone."""
+    """Return, by name, the robots of keyframes and loops; empty for a map of one robot."""
     if not (state.others or state.robot):
         return {}
     return {'keyframe_robots': state.graph.robot, 'robot': state.robot,

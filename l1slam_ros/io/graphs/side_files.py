@@ -7,12 +7,12 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The files beside a graph file, for what no graph format has a place for.
+The files beside a graph file, for data that graph formats have no place for.
 
     <path>.stamps.txt    `id seconds`, one line for each vertex; or `seconds` alone, in their order
     <path>.trusted.txt   `i j`, the vertex ids of each loop that is never doubted
-    <path>.struck.txt    `i j`, of each loop that a person struck out; in both, loops are doubted:
-                         one of several between two vertices was struck out, another trusted
+    <path>.struck.txt    `i j`, of each loop that a person struck out. Loops between vertices that
+                         are in both files are judged: one of them is true, another false
     <path>.truth.txt     `id x y theta`, true poses; see `trajectory`
     <path>.false.txt     `i j`, the vertex ids of each edge known to be a false loop
 """
@@ -41,23 +41,23 @@ from l1slam_ros.io.files import (
 )
 from l1slam_ros.io.ours import marked
 
-# All that may lie beside an input, and what is written, or else removed, beside a graph.
+# What may be beside an input; and of that, what is written, or else removed, beside a graph.
 BESIDE = ('stamps', 'trusted', 'struck', 'truth', 'false')
 WRITTEN_BESIDE = BESIDE[:3]
 
 
 def beside(path: str | os.PathLike[str], what: str) -> Path:
-    """Return the name of the file that has `what`, as stamps, of a graph or a bag."""
+    """Return the name of a file beside a graph or a bag; what : of `BESIDE`."""
     return Path(f'{os.fspath(path)}.{what}.txt')
 
 
 def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | None,
                  factors: BetweenFactors) -> None:
     """
-    Write the files beside a graph: ids, stamps [ns] (n,), and its factors, for what a person said.
+    Write the stamps, and the trusted and struck-out loops, beside a graph.
 
-    Where there is nothing to say there will be no such file. Odometry is no loop, and trusted
-    anyway.
+    ids, stamps : (n,) vertex ids and stamps [ns]; factors : of the graph. A file without content
+    is not written, and an old one is removed. Odometry is always trusted and not listed.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | N
 
 @contextmanager
 def _replaced(path: Path, lines: list[str]) -> Iterator[None]:
-    """Replace a file by these lines once the block succeeds; without lines remove it."""
+    """Replace a file by these lines when the block succeeds; without lines remove it."""
     if lines:
         with replacing(path) as temporary:
             put_lines(temporary, marked(lines))
@@ -89,11 +89,11 @@ def _replaced(path: Path, lines: list[str]) -> Iterator[None]:
 
 def read_stamps(path: str | os.PathLike[str], ids: Indices) -> Indices | None:
     """
-    Return the stamps [ns] of the vertices `ids` (n,) of a graph; None without a file of them.
+    Return the stamps [ns], (n,), of the vertices `ids` (n,); None without a file of stamps.
 
     Raises
     ------
-    FileError : the file is damaged, or is not about these vertices.
+    FileError : the file is malformed, or has other vertices.
 
     """
     side = beside(path, 'stamps')
@@ -121,24 +121,24 @@ def named_loops(path: str | os.PathLike[str], what: str, ids: Indices,
     """
     Return which factors of a graph are loops that a file beside it names, (m,) bool.
 
-    All loops between two vertices that it names are, either way round. what : `trusted`,
-    `struck` or `false`; ids : (n,) of the keyframes.
+    A line names all loops between its two vertices, in either direction. what : `trusted`,
+    `struck` or `false`; ids : (n,) vertex ids of the keyframes.
 
     Raises
     ------
-    FileError : naming the line, when the file is damaged or names vertices without an edge, or
-        to strike out odometry.
+    FileError : naming the line, if the file is malformed, names vertices without an edge, or
+        strikes out odometry.
 
     """
     named, numbers = read_pairs(path, what)
     if not len(named):
         return np.zeros(len(factors), bool)
-    # Ids may be any 64 bits, so pairs of them are numbered anew.
+    # Ids have up to 64 bits, so pairs of them are numbered.
     both = np.sort(np.concatenate((ids[factors.pairs], named)), axis=1)
     number = np.unique(both, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0: (m, 1)
     edges = number[:len(factors)]
     chosen = number[len(factors):]
-    # Odometry is trusted anyway; that it is struck out would go unheard.
+    # Odometry cannot be struck out; to ignore such a line would be misleading.
     kind, known = ('loop', edges[~factors.is_odometry]) if what == 'struck' else ('edge', edges)
     unknown = ~np.isin(chosen, known)
     if unknown.any():
@@ -150,13 +150,13 @@ def named_loops(path: str | os.PathLike[str], what: str, ids: Indices,
 
 def read_pairs(path: str | os.PathLike[str], what: str) -> tuple[Indices, list[int]]:
     """
-    Return the vertex ids (k, 2) that a file beside a graph or a bag names, and their lines.
+    Return the vertex ids (k, 2) in a file beside a graph or a bag, and their line numbers.
 
-    None where there is no such file.
+    Both are empty if there is no such file.
 
     Raises
     ------
-    FileError : naming the line, when the file is damaged.
+    FileError : naming the line, if the file is malformed.
 
     """
     side = beside(path, what)

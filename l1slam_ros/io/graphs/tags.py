@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The lines of graph files by their tags: how those are read that are used, and why others are not.
+The tags of graph files: how the lines of each are read, and which lines are not used, and why.
 
 A line is a tag, one or two vertex ids, a pose, and the upper triangle of an information matrix:
 
@@ -20,17 +20,17 @@ A line is a tag, one or two vertex ids, a pose, and the upper triangle of an inf
     EDGE_SE3_PRIORXYZ id x y z xx xy ...                   EDGE_SE3_PRIORXY id x y xx xy yy
     EDGE_SE3_SWITCHABLE i j k x y z qx qy qz qw xx ...     EDGE_SE2_SWITCHABLE i j k x y theta ...
 
-Those of the last lines but one are hdl_graph_slam's GPS. The last ones are loops of Vertigo and
-RTAB-Map, with a vertex k that would switch them off: here it is judged which are true.
+The last lines but one are GPS positions of hdl_graph_slam. The last ones are loops of Vertigo and
+RTAB-Map with a switch variable, vertex k, which is ignored: here the robust solve judges loops.
 
-Priors are absolute factors; rows and columns of zeros in the information say nothing. The number
-after the id of one in space is that of a `PARAMS_SE3OFFSET` between the robot and what was
-measured, which must be none.
+Priors are absolute factors; a component with a zero row and column in the information is not
+measured. The number after the id of a prior in space is that of a `PARAMS_SE3OFFSET`, the pose of
+the sensor on the robot; only the identity is supported.
 
-**TORO orders the information of the plane otherwise** (forward, sideways, rotation: `ff fs ss rr
-fr sr`). **g2o's rotation in space is the quaternion's vector part**, half the angle: the rotation
-block of its information is four times that of the angle, the blocks beside it twice. Not all who
-write its files know; TORO's information is of the angles.
+**TORO orders the information of the plane differently** (forward, sideways, rotation: `ff fs ss rr
+fr sr`). **The rotation error of g2o in space is the vector part of the quaternion**, half the
+angle: the rotation block of its information is four times that of the angle, and the blocks beside
+it are twice. Some programs that write g2o ignore that; TORO's information is that of the angles.
 """
 
 from collections.abc import Callable
@@ -59,11 +59,11 @@ class Tag:
     """
     How the lines of one tag are read.
 
-    kind : vertex, between, switched (between, too), absolute or position (absolute, too); ids :
-    how many whole numbers lead, the first `vertices` of which are vertex ids; values : how many
-    numbers of a pose follow, which `read` turns into the first ones of a pose of the manifold, the
-    rest is that of the identity; information : row and column of each entry of the upper triangle,
-    in the order of the file; none for a vertex.
+    kind : vertex, between, switched (a between factor), absolute, position (an absolute factor);
+    ids : number of leading whole numbers, the first `vertices` of which are vertex ids; values :
+    number of values of the pose that follow; `read` converts them to the first values of a pose of
+    the manifold, and the others are those of the identity; information : row and column of each
+    entry of the upper triangle, in the order of the file; empty for a vertex.
     """
 
     kind: str
@@ -85,7 +85,7 @@ class Tag:
 
     def units(self, rotation_information: str) -> Array:
         """
-        Return how many of the file's units a unit of each entry of the residual is, (d,).
+        Return the size of a unit of each residual component, in the units of the file, (d,).
 
         rotation_information : of `names.ROTATION_INFORMATION`
         """
@@ -102,7 +102,7 @@ def _triangle(size: int) -> tuple[tuple[int, int], ...]:
 
 _TORO_PLANE = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 
-# Of each kind on each manifold the first is g2o's, which is the one that is written.
+# The first tag of each kind on each manifold is g2o's, which is written.
 TAGS = {
     'VERTEX_SE2': Tag('vertex', se2, 1, 3),
     'EDGE_SE2': Tag('between', se2, 2, 3, _triangle(3)),
@@ -122,13 +122,13 @@ TAGS = {
     'EDGE3': Tag('between', se3, 2, 6, _triangle(6), _from_angles),
 }
 FACTORS = 'between', 'switched', 'absolute', 'position'
-# What g2o measures an absolute pose in space by: its line where there is no offset.
+# g2o needs this line for absolute poses in space: an offset of zero.
 OFFSET = 'PARAMS_SE3OFFSET'
 NO_OFFSET = f'{OFFSET} 0 0 0 0 0 0 0 1'
 
 _LANDMARKS = 'landmarks are no part of a pose graph'
 SENSORS = 'sensor data and calibration are no part of a pose graph'
-# Known and left out, with the reason that is told; PARAMS_... and FIX are, too.
+# Tags that are known but not used, with the reason; so are PARAMS_... and FIX.
 TAGS_LEFT_OUT = {
     **dict.fromkeys((
         'VERTEX_XY', 'EDGE_SE2_XY', 'EDGE_BEARING_SE2_XY', 'EDGE_SE2_XY_CALIB', 'EDGE_POINTXY',

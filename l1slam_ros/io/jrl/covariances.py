@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances of a JRL file -> roots of information, and back."""
+"""Converting the covariances of a JRL file to square-root information, and back."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from l1slam_ros.io.files import counted, rounded
 from l1slam_ros.io.jrl.document import Node
 from l1slam_ros.io.jrl.layout import SILENT, swapped
 
-# Files print six digits or more.
+# Relative asymmetry that rounding may cause: files have six digits or more.
 _ASYMMETRY = 1e-4
 _LEAST = 1e-30
 
@@ -33,7 +33,7 @@ def roots_of(nodes: list[Node], manifold: Manifold) -> tuple[Array, list[str]]:
 
     Raises
     ------
-    FileError : one is not symmetric, has a variance of 0 or less, or says nothing at all.
+    FileError : one is not symmetric, has a variance of 0 or less, or measures no component.
 
     """
     d = manifold.TANGENT_SIZE

@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-JSON of strangers, as text or as CBOR: read within bounds, each value with its place for errors.
+Reading JSON or CBOR from others within limits; each value knows its place, for errors.
 
-The place of a value is what leads to it, as in `measurements.a[3].stamp`.
+The place of a value is its path, as in `measurements.a[3].stamp`.
 """
 
 import json
@@ -24,14 +24,14 @@ from l1slam_ros.io.files import LARGEST, counted, quoted, reported
 # [bytes] Of a graph of half a million factors. Python takes thirty times as much at worst.
 _LARGEST_FILE = 2**29
 _DEEPEST = 64
-# The values of these tags stand for others, or for each other: a few bytes may stand for hours.
+# These tags stand for other values, or refer to each other: a few bytes may expand for hours.
 _TAGS = range(2**9)
 CBOR_SUFFIX = '.cbor'
 
 
 class Node:
     """
-    A value of a document, and where it stands.
+    A value of a document, and its place.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Node:
         raise FileError(node._above, f'{where}{_described(self.value)}; expected {expected}')
 
     def members(self) -> Iterator[tuple[str, 'Node']]:
-        """Yield names and values of an object; of null, as an empty one is written, none."""
+        """Yield names and values of an object; none for null, as an empty object is written."""
         if self.value is not None and not isinstance(self.value, dict):
             self.refuse('an object')
         for name, value in (self.value or {}).items():
@@ -67,20 +67,20 @@ class Node:
             yield name, Node(value, self, name)
 
     def elements(self) -> Iterator['Node']:
-        """Yield the values of a list; of null, as an empty one is written, none."""
+        """Yield the values of a list; none for null, as an empty list is written."""
         if self.value is not None and not isinstance(self.value, list):
             self.refuse('a list')
         for k, value in enumerate(self.value or ()):
             yield Node(value, self, k)
 
     def find(self, name: str) -> 'Node | None':
-        """Return a member of an object, None where it has none of this name."""
+        """Return a member of an object, or None if there is none of this name."""
         if not isinstance(self.value, dict):
             self.refuse(f'an object with {quoted(name)}')
         return Node(self.value[name], self, name) if name in self.value else None
 
     def __getitem__(self, name: str) -> 'Node':
-        """Return a member of an object, which it must have."""
+        """Return a member of an object; raise if there is none of this name."""
         node = self.find(name)
         if node is None:
             Node(None, self, name).refuse('a value')
@@ -106,7 +106,7 @@ class Node:
         return float(self.value)
 
     def numbers(self, count: int) -> list[float]:
-        """Return a list of so many numbers."""
+        """Return a list of `count` numbers."""
         if not isinstance(self.value, list) or len(self.value) != count:
             self.refuse(f'a list of {count} numbers')
         return [node.number() for node in self.elements()]
@@ -131,14 +131,14 @@ def read_document(path: Path) -> Node:
 
 
 def document_bytes(path: Path, value: Any) -> bytes:
-    """Return a document as the bytes of the file `path`: numbers read back the very same."""
+    """Serialise a document for the file `path`; numbers are read back exactly."""
     if is_cbor(path):
         return bytes(cbor_library().dumps(value))
     return json.dumps(value, separators=(',', ':')).encode() + b'\n'
 
 
 def is_cbor(path: Path) -> bool:
-    """Tell whether a file is taken for CBOR."""
+    """Tell whether a file is read as CBOR, by its name."""
     return path.suffix.lower() == CBOR_SUFFIX
 
 

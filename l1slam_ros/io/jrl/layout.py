@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What stands in a JRL file and where: the names of its parts, and how their numbers are ordered.
+The layout of a JRL file: the names of its parts, and the order of their numbers.
 
 JSON, or the same as CBOR; the format of COSMO-Bench, as the library `jrl` reads and writes it:
 
@@ -24,7 +24,7 @@ JSON, or the same as CBOR; the format of COSMO-Bench, as the library `jrl` reads
 **A covariance in space has the rotation first**, as GTSAM has it; both are in the axes of the
 measured pose. Stamps are nanoseconds, or they count.
 
-What this program writes has one member more, `OURS`, that the library passes over:
+Files of this program have one more member, `OURS`, which the library ignores:
 
     left_out    robot -> [entry, measurement, word], why a map was made without them, see
                 `graphs.left_out`; all of them are in `outlier_factors`, too
@@ -50,13 +50,13 @@ FACTORS = MappingProxyType({
     'BetweenFactorPose2': (se2, False), 'PriorFactorPose2': (se2, True),
     'BetweenFactorPose3': (se3, False), 'PriorFactorPose3': (se3, True)})
 POSES = MappingProxyType({'Pose2': se2, 'Pose3': se3})
-# [m^2], [rad^2] From here on a variance says nothing of its component; the format knows no other
-# way to say that.
+# [m^2], [rad^2] A variance of this size or more means that the component is not measured; the
+# format has no other way to say that.
 SILENT = 1e12
 
 
 def kind_of(manifold: Manifold, absolute: bool) -> str:
-    """Return the name of a kind of factors."""
+    """Return the type of a factor in the file."""
     return next(name for name, kind in FACTORS.items() if kind == (manifold, absolute))
 
 

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""A JRL file -> a graph, and the rest that it says; see `layout`."""
+"""Reading a JRL file as a graph with its further content; see `layout`."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -61,7 +61,7 @@ class _Factors:
     circles: int = 0
 
     def add(self, node: Node, robot: int, entry: int, number: int) -> None:
-        """Take a measurement in."""
+        """Add a measurement."""
         kind = node['type'].text()
         manifold, alone = FACTORS.get(kind, (None, False))
         if manifold is None:
@@ -84,12 +84,12 @@ class _Factors:
 
     @property
     def places(self) -> dict[tuple[int, int, int], int]:
-        """The number among the factors of each that is one, by robot, entry and number."""
+        """(robot, entry, number in the entry) -> the number of the factor."""
         return {(*entry, number): k for k, (entry, number) in enumerate(
             zip(self.entries, self.numbers, strict=True))}
 
     def sentences(self) -> list[str]:
-        """Return a sentence on each kind of measurement that is not used."""
+        """Return a sentence for each kind of measurement that is not used."""
         circles = [f'{counted(self.circles, "edge")} from a key to itself not used'] if (
             self.circles) else []
         return circles + [f'{count:,} {kind if kind.isalnum() else "odd"} '
@@ -99,10 +99,10 @@ class _Factors:
 
 def read_jrl_file(path: Path, rotation_information: str = QUATERNION) -> GraphRecord:
     """
-    Read a JRL file, and beside it what a person said of loops.
+    Read a JRL file, with the vouched-for and struck-out loops beside it.
 
-    Which factor is odometry, and of which robot a key is, is told by the keys; see `robots`.
-    Priors are absolute poses. The initialization is the stored start where it has all keys.
+    The keys tell which factors are odometry, and which robot a keyframe belongs to; see `robots`.
+    Priors are absolute poses. The initialization is the stored start if it has all keys.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def _letter(node: Node) -> str:
 
 
 def _factors(root: Node, letters: dict[str, int]) -> tuple[_Factors, tuple[tuple[int, ...], ...]]:
-    """Return the factors in the order of the robots, and the stamps of each robot's entries."""
+    """Read the factors in the order of the robots; return them with the stamps of all entries."""
     factors = _Factors()
     stamps = []
     measurements = root['measurements']
@@ -208,7 +208,7 @@ def _factors(root: Node, letters: dict[str, int]) -> tuple[_Factors, tuple[tuple
 
 
 def _values(node: Node | None, manifold: Manifold) -> dict[int, list[float]]:
-    """Return the poses of keys; where robots say it of the same key, that whose letter it has."""
+    """Return the poses of keys; if several robots give one, that of the robot of the key."""
     rows: dict[int, list[float]] = {}
     for letter, values in node.members() if node else ():
         for value in values.elements():
@@ -240,7 +240,7 @@ def _log(path: Path, root: Node, letters: dict[str, int],
 
 
 def _flagged(node: Node | None, letters: dict[str, int], factors: _Factors) -> Mask | None:
-    """Return which factors are named, (m,) bool; None: there is no list of them."""
+    """Return which factors a list names, (m,) bool; None if there is no such list."""
     if node is None or node.value is None:
         return None
     mask = np.zeros(len(factors.nodes), bool)
@@ -251,7 +251,7 @@ def _flagged(node: Node | None, letters: dict[str, int], factors: _Factors) -> M
 
 def _named(node: Node, letters: dict[str, int], factors: _Factors,
            size: int) -> list[tuple[int, list[Node]]]:
-    """Return the factors that a part names, and what it says of each: lists of `size` values."""
+    """Return the factors that a part names, and for each a list of `size` values."""
     places = factors.places
     found = []
     for letter, list_ in node.members():

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""When the keyframes of a JRL file were, by the stamps of its entries."""
+"""The stamps of the keyframes of a JRL file, from the stamps of its entries."""
 
 import numpy as np
 

@@ -7,12 +7,12 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A graph -> a JRL file; see `layout`.
+Writing a graph as a JRL file; see `layout`.
 
-A graph that came from such a file goes back with its entries, stamps and flags. Of another one
-each keyframe makes an entry, its stamp counts where the graph has no times; a factor stands in the
-entry of its later keyframe. What a map was made without stands where it was, and is listed in
-`outlier_factors`: **who reads the file and does not look there takes it in**.
+A graph that was read from such a file keeps its entries, stamps and flags. For other graphs there
+is one entry for each keyframe, with a counter as stamp if the graph has no stamps; a factor is in
+the entry of its later keyframe. Factors that the map does not use stay in their entries and are
+listed in `outlier_factors`: **a program that ignores this list uses them**.
 """
 
 import os
@@ -37,7 +37,7 @@ from l1slam_ros.io.jrl.document import document_bytes
 from l1slam_ros.io.jrl.layout import MARK_NAME, OURS, kind_of, values_of
 from l1slam_ros.io.ours import WROTE
 
-# The robot of keys without a letter.
+# The robot for keys without a letter.
 _ONE = ord('a')
 _Parts = dict[str, list[Any]]
 
@@ -45,13 +45,13 @@ _Parts = dict[str, list[Any]]
 def write_jrl_file(path: str | os.PathLike[str], record: GraphRecord,
                    truth: Array | None = None) -> None:
     """
-    Write a graph with its poses, every number such that it reads back the same.
+    Write a graph with its poses; numbers are read back exactly.
 
     truth : (n, p) true poses, in the place of those of the log
 
     Raises
     ------
-    FileError : the file cannot be written, or an id is no key.
+    FileError : the file cannot be written, or an id cannot be a key.
     MissingError : the library that writes CBOR is not installed.
 
     """

@@ -7,26 +7,25 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-ROS messages -> records, by their attributes: rclpy's and rosbags' messages alike, without ROS.
+Converting ROS messages of rclpy or rosbags to records, by their attributes; this needs no ROS.
 
 A message that cannot be used raises `MessageError` with one of these causes:
 
-    encoding     bytes that are no message
-    stamp        zero (never set), negative, or no time
+    encoding     the bytes are not a message
+    stamp        zero (never set), negative, or not a time
     not_finite   NaN or infinity in the pose
-    range        so far away that it can only be garbage
+    range        the position is too far away to be meaningful
     quaternion   its norm is far from 1
     frame        a loop whose frame is not `<base_frame>@<sec>.<nanosec, 9 digits>`, an absolute
                  pose in another frame than that of the map
     order        a loop whose reference is not earlier than its stamp
 
-Covariances pass as they come: `graph_builder` decides what they are worth.
+Covariances are passed on unchecked: `graph_builder` decides whether to use them.
 """
 
 import math
 import re
 import struct
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -43,7 +42,9 @@ from l1slam_ros.core.graph.measurements import (
 )
 from l1slam_ros.io.files import LAST_STAMP, NANOSECONDS, quoted, stamp_text
 
-# Of a nav_msgs/Odometry: pose and its covariance, twist and its covariance.
+ABSOLUTE = 'absolute_poses'
+LOOP_TOPICS = ('loop_closures', 'trusted_loop_closures', 'false_loop_closures', ABSOLUTE)
+# Numbers in a nav_msgs/Odometry: pose and its covariance, twist and its covariance.
 _ODOMETRY_ENTRIES = 7 + 36 + 6 + 36
 _REFERENCE_FRAME = re.compile(
     r'/?(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
@@ -69,13 +70,13 @@ def odometry_sample(message: Any) -> OdometrySample:
 
 def odometry_in(data: bytes) -> tuple[str, OdometrySample]:
     """
-    Return the child frame of a serialised odometry message, and its sample.
+    Return the frame of a serialised nav_msgs/Odometry, and its sample.
 
-    By its layout, in a quarter of the time that rclpy takes to make the objects of a message.
+    The bytes are read by their layout, in a quarter of the time of rclpy's deserialisation.
 
     Raises
     ------
-    MessageError : it breaks off, or is no CDR, or cannot be used.
+    MessageError : it is cut, is not CDR, or cannot be used.
 
     """
     try:
@@ -93,9 +94,9 @@ def odometry_in(data: bytes) -> tuple[str, OdometrySample]:
 
 def _odometry_parts(data: bytes) -> tuple[tuple[int, int], str, str, Array]:
     """
-    Return stamp, frame, child frame and the 85 numbers of a nav_msgs/Odometry in CDR.
+    Return stamp, frame, child frame and the 85 numbers of a nav_msgs/Odometry in CDR (bytes).
 
-    The CDR begins with four bytes that say its byte order; each value lies at a multiple of its
+    CDR begins with four bytes that give the byte order; each value is at a multiple of its
     own size from there. A string is its length with the closing zero, then its characters.
     """
     if data[0] or data[1] > 1:
@@ -111,7 +112,7 @@ def _odometry_parts(data: bytes) -> tuple[tuple[int, int], str, str, Array]:
 
 
 def _text(data: bytes, place: int, length: int) -> tuple[str, int]:
-    """Return a string of some length with its closing zero, and the place behind it."""
+    """Return the string at `place`, and the place behind it; length : with its closing zero."""
     end = place + length
     if not length or data[end - 1]:
         raise ValueError('no string')
@@ -126,9 +127,9 @@ def loop_closure(message: Any, base_frame: str, trusted: bool,
     Parameters
     ----------
     message : its `header.frame_id` names the earlier time, see `reference_frame_id`
-    base_frame : the frame that must be named there; empty: any
+    base_frame : the frame that must be named with it; empty: any
     trusted : whether a person or a marker vouches for it
-    ordered : the reference has to be earlier than the stamp; not so between two robots
+    ordered : the reference must be earlier than the stamp; between two robots it need not be
 
     Raises
     ------
@@ -147,7 +148,7 @@ def false_loop(message: Any, base_frame: str, ordered: bool = True) -> LoopClosu
 
     Raises
     ------
-    MessageError : it names no two times.
+    MessageError : it does not name two times.
 
     """
     return LoopClosure(*_ends(message, base_frame, ordered), np.array((0.0, 0, 0, 0, 0, 0, 1)),
@@ -158,12 +159,12 @@ def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
     """
     Return the absolute pose of the robot in a geometry_msgs/PoseWithCovarianceStamped.
 
-    Where it says nothing of the rotation, the quaternion may be any, also none.
+    If its covariance says that the rotation is not measured, the quaternion is not read.
 
     Parameters
     ----------
     message : its `header.frame_id` is the map frame
-    map_frame : as which that is known; empty: any
+    map_frame : the name that this must be; empty: any
 
     Raises
     ------
@@ -182,26 +183,30 @@ def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
     return LoopClosure(None, stamp, checked_pose3(position, rotation), covariance)
 
 
-# Topic -> what a PoseWithCovarianceStamped on it says, by the frames of the robot and of the map.
-LOOPS: dict[str, Callable[[Any, str, str], LoopClosure]] = {
-    'loop_closures': lambda message, base, _: loop_closure(message, base, False),
-    'trusted_loop_closures': lambda message, base, _: loop_closure(message, base, True),
-    'false_loop_closures': lambda message, base, _: false_loop(message, base),
-    'absolute_poses': lambda message, _, of_map: absolute_pose(message, of_map)}
+def loop_in(topic: str, message: Any, base_frame: str, map_frame: str,
+            ordered: bool = True) -> LoopClosure:
+    """
+    Return the loop or absolute pose in a message on one of `LOOP_TOPICS`.
 
+    base_frame, map_frame, ordered : see the functions above
 
-# The same of a loop between two robots, by the frame of the one from which the other is seen.
-LOOPS_BETWEEN: dict[str, Callable[[Any, str], LoopClosure]] = {
-    'loop_closures': lambda message, base: loop_closure(message, base, False, False),
-    'trusted_loop_closures': lambda message, base: loop_closure(message, base, True, False),
-    'false_loop_closures': lambda message, base: false_loop(message, base, False)}
+    Raises
+    ------
+    MessageError : it cannot be used.
+
+    """
+    if topic == ABSOLUTE:
+        return absolute_pose(message, map_frame)
+    if topic == 'false_loop_closures':
+        return false_loop(message, base_frame, ordered)
+    return loop_closure(message, base_frame, topic == 'trusted_loop_closures', ordered)
 
 
 def stamped_pose(message: Any) -> tuple[int, Array]:
     """
     Return the stamp [ns] and x y z qx qy qz qw (7,) of a message with a pose or a transform.
 
-    Of geometry_msgs a PoseStamped, PoseWithCovarianceStamped or TransformStamped, or an Odometry.
+    A PoseStamped, PoseWithCovarianceStamped or TransformStamped of geometry_msgs, or an Odometry.
 
     Raises
     ------
@@ -226,7 +231,7 @@ def stamp_of(header: Any) -> int:
 
     Raises
     ------
-    MessageError : it is zero, negative or no time.
+    MessageError : it is zero, negative or not a time.
 
     """
     return _checked_stamp(int(header.stamp.sec), int(header.stamp.nanosec))
@@ -242,11 +247,11 @@ def _checked_stamp(seconds: int, nanoseconds: int) -> int:
 
 def checked_pose3(t: Any, q: Any) -> Array:
     """
-    Return translation and rotation as one (7,), the quaternion normalised.
+    Return translation and quaternion as one array (7,), the quaternion normalised.
 
     Raises
     ------
-    MessageError : they are no pose.
+    MessageError : they are not a pose.
 
     """
     return sound_pose3((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
@@ -281,7 +286,7 @@ def _pose3(pose: Any) -> Array:
 
 
 def _size(vector: Any) -> float:
-    """Return the length of a geometry_msgs/Vector3, 0 where that is none of a twist."""
+    """Return the length of a geometry_msgs/Vector3; 0 if it is too large for a twist."""
     return _length(vector.x, vector.y, vector.z)
 
 
@@ -291,5 +296,5 @@ def _length(*components: float) -> float:
 
 
 def _covariance(entries: Any) -> Array:
-    """Return 36 row-major entries as (6, 6), a copy: a message may be reused."""
+    """Return 36 row-major entries as an array (6, 6), copied, as messages may be reused."""
     return np.array(entries, float).reshape(6, 6)

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A graph of edges between numbered keyframes, collected from the messages of a front end.
+Collecting a graph of edges between numbered keyframes from the messages of a front end.
 
 The transform of an edge is the pose of its second keyframe, seen from the first. The poses that a
-front end publishes are its own map: they are never read, for they would be taken for odometry.
+front end publishes are its own map; they are never read.
 """
 
 from abc import ABC, abstractmethod
@@ -45,7 +45,7 @@ class Edge(NamedTuple):
 
 
 class Told(NamedTuple):
-    """An edge as a message has it: its pose by the fields of a message, not yet checked."""
+    """An unchecked edge: position and orientation are fields of a message."""
 
     i: int
     j: int
@@ -56,19 +56,19 @@ class Told(NamedTuple):
 
 
 class EdgeGraph(ABC):
-    """A graph, message by message; each edge is taken once."""
+    """A graph that grows message by message; an edge that is sent again is used once."""
 
     def __init__(self) -> None:
         self._stamps: dict[int, int] = {}
-        # None: it cannot be used.
+        # None: an edge that cannot be used.
         self._edges: dict[tuple[int, int, bool], Edge | None] = {}
 
     def take(self, message: Any, topic: str = '') -> Iterator[LoopClosure | MessageError]:
         """
-        Yield the loops that are new in a message, and an error for each that cannot be used.
+        Yield the new loops of a message, and an error for each that cannot be used.
 
-        Its errors' causes are those of `conversion`, and `robot`, `keyframe`: a loop between two
-        robots, or of a keyframe whose time nobody knows. Such a loop is in `graph` all the same.
+        The causes of errors are those of `conversion`, and `robot` and `keyframe`: a loop between
+        robots, or of a keyframe without a known stamp. The method `graph` has such loops, too.
 
         topic : that of the message
         """
@@ -80,7 +80,7 @@ class EdgeGraph(ABC):
 
     @abstractmethod
     def _told(self, message: Any, topic: str) -> Iterator[Told]:
-        """Yield the edges in a message, and note the times of keyframes."""
+        """Yield the edges in a message, and store the stamps of its keyframes."""
 
     def _taken(self, told: Told) -> Iterator[LoopClosure | MessageError]:
         key = (min(told.i, told.j), max(told.i, told.j), told.is_loop)
@@ -116,7 +116,7 @@ class EdgeGraph(ABC):
         """
         Return all edges so far as a graph, and the numbers of its keyframes, (n,).
 
-        options : where no covariance is stated, their models speak
+        options : their noise models are used where no covariance is stated
         """
         edges = self._used()
         numbers = np.array([(edge.i, edge.j) for edge in edges], np.int64).reshape(-1, 2)
@@ -135,12 +135,12 @@ class EdgeGraph(ABC):
         return graph, ids
 
     def sentences(self) -> list[str]:
-        """Return a sentence on each kind of edge that was not put into the graph."""
+        """Return a sentence for each kind of edge that is not in the graph."""
         return []
 
 
 def _of_motion(manifold: Manifold, measured: Array, options: OdometryOptions) -> Array:
-    """Return the model's covariance of each motion, (m, d, d), by its length and turn."""
+    """Return the covariance of each motion (m, p) by the odometry model, (m, d, d)."""
     rest = manifold.identity(len(measured))
     lengths, angles = manifold.motion(manifold.local(rest, measured))
     return np.array([diagonal_covariance(

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Which messages of other front ends are read, by their types, and on which topics of the node."""
+"""The messages of other front ends that are read: their types, and their topics in the node."""
 
 from typing import NamedTuple
 
@@ -18,9 +18,9 @@ from l1slam_ros.io.messages.swarm_slam import BETWEEN, KEYFRAME, WITHIN, SwarmSl
 
 class FrontEnd(NamedTuple):
     """
-    What makes its graph, its topics in the node with their types, the type that has its loops.
+    A front end: the class of its graph, its topics with their types, the type of its loops.
 
-    is_found : a bag without other odometry is taken for one of it.
+    is_found : its graph is read from a bag that has no odometry topic.
     """
 
     graph: type[EdgeGraph]
@@ -29,7 +29,7 @@ class FrontEnd(NamedTuple):
     is_found: bool = False
 
     def loops_or_keyframes(self) -> set[str]:
-        """Return the types without which there is no graph."""
+        """Return the types of the messages with loops and with keyframes."""
         return {self.loops, next(iter(self.topics.values()))}
 
 
@@ -45,5 +45,5 @@ LOOP_TYPES = tuple(one.loops for one in FRONT_ENDS)
 
 
 def front_end_of(msgtype: str) -> FrontEnd | None:
-    """Return the front end that a type of messages is of, if any."""
+    """Return the front end that sends messages of this type, if any."""
     return next((one for one in FRONT_ENDS if msgtype in one.topics.values()), None)

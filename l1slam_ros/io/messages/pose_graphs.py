@@ -7,14 +7,13 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Pose graphs that front ends publish: their loop closures by stamps, or the graph as a whole.
+Reading `rtabmap_msgs/MapGraph` and `pose_graph_tools_msgs/PoseGraph`.
 
-Read are `rtabmap_msgs/MapGraph` and `pose_graph_tools_msgs/PoseGraph`, by their attributes. Each
-message repeats the graph so far, or adds to it. Only measurements count: no virtual link, prior,
-landmark, gravity, mesh, nor what the front end itself has rejected.
+Each message repeats the graph so far, or adds to it. Only measurements are used: no virtual links,
+priors, landmarks, gravity or meshes, and no loops that the front end itself has rejected.
 
-RTAB-Map names keyframes by numbers alone. The newest of a message is that of the message's stamp;
-the times of those that came before the first message nobody knows.
+RTAB-Map names keyframes by numbers alone. The newest keyframe of a message has the stamp of the
+message; the stamps of keyframes before the first message are unknown.
 """
 
 from collections.abc import Iterator
@@ -29,14 +28,14 @@ from l1slam_ros.io.messages.edge_graph import EdgeGraph, Told
 
 MAP_GRAPH = 'rtabmap_msgs/msg/MapGraph'
 POSE_GRAPH = 'pose_graph_tools_msgs/msg/PoseGraph'
-# Types of edges: the odometry's; loops, of RTAB-Map: global, local in space and time, by a user.
+# Types of edges: 0 odometry; RTAB-Map's loops: global, local in space, local in time, by a user.
 _ODOMETRY = 0
 _LINKS = {_ODOMETRY, 1, 2, 3, 4}
 _EDGES = {_ODOMETRY, 1}
 
 
 class PoseGraphs(EdgeGraph):
-    """The graph of one robot, message by message."""
+    """The graph of one robot."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -50,7 +49,7 @@ class PoseGraphs(EdgeGraph):
         newest, known = max(message.poses_id, default=0), max(self._stamps, default=0)
         if newest > known:
             self._stamps[newest] = stamp_of(message.header)
-        elif newest < known:  # begun anew, or its newest are gone: their numbers come again
+        elif newest < known:  # a new map, or keyframes were removed: numbers are used again
             self._stamps = {k: stamp for k, stamp in self._stamps.items() if k < newest}
             self._edges = {key: edge for key, edge in self._edges.items() if key[1] < newest}
         for link in message.links:
@@ -73,6 +72,6 @@ class PoseGraphs(EdgeGraph):
 
 
 def _inverse(information: Any) -> Array:
-    """Return the covariance (6, 6) of an information, zeros where it has none."""
+    """Return the inverse (6, 6) of an information; zeros if it has none."""
     matrix = np.array(information, float).reshape(6, 6)
     return np.linalg.inv(matrix) if usable(matrix[None])[0] else np.zeros((6, 6))

@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Poses -> bytes of ROS messages (CDR, little endian), from arrays and stamps, without ROS.
+Serialising poses to ROS messages (CDR, little endian) from arrays and stamps, without ROS.
 
-For what is published often, or is large, and for bags: to make the objects of its message takes
+For bags, and for messages that are large or published often: making the message objects takes
 too long.
 """
 
@@ -28,7 +28,7 @@ _ENCAPSULATION = b'\x00\x01\x00\x00'
 
 
 def cdr(*parts: tuple[int, bytes | memoryview]) -> bytes:
-    """Return a serialised message of parts, each at a multiple of so many bytes from the start."""
+    """Return a serialised message; each part begins at a multiple of its number of bytes."""
     data = bytearray()
     for multiple, part in parts:
         data += bytes(-len(data) % multiple)
@@ -86,7 +86,7 @@ def pose_bytes(frame: str, stamp: int, pose3: Array, covariance: Array | None = 
     """
     Return a serialised geometry_msgs/PoseStamped: one pose (7,) at one time [ns].
 
-    covariance : (6, 6), then it is a PoseWithCovarianceStamped
+    covariance : (6, 6); with it the message is a PoseWithCovarianceStamped
     """
     rest = b'' if covariance is None else covariance.tobytes()
     return cdr((4, header_bytes(frame, stamp)), (8, pose3.tobytes() + rest))
@@ -100,7 +100,7 @@ def odometry_bytes(frame: str, child: str, stamp: int, pose3: Array, covariance:
 
 
 def scan_bytes(frame: str, scan: 'Scan') -> bytes:
-    """Return a serialised sensor_msgs/LaserScan without intensities, its rays of one moment."""
+    """Return a serialised sensor_msgs/LaserScan without intensities."""
     last = scan.angle_min + scan.angle_increment * (len(scan.ranges) - 1)
     numbers = (scan.angle_min, last, scan.angle_increment, scan.time_increment, 0.0,
                scan.range_min, scan.range_max)
@@ -114,7 +114,7 @@ def transform_bytes(parent: str, child: str, stamp: int, pose3: Array,
     """
     Return a serialised geometry_msgs/TransformStamped: the pose (7,) of the child in the parent.
 
-    in_sequence : as the only one of a sequence, which is a tf2_msgs/TFMessage
+    in_sequence : as a sequence of one transform, which is a tf2_msgs/TFMessage
     """
     return cdr((4, struct.pack('<I', 1) if in_sequence else b''), (4, header_bytes(parent, stamp)),
                (4, string_bytes(child)), (8, pose3.tobytes()))

@@ -7,12 +7,12 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The graph of slam_toolbox: `PoseGraph`, and `NewNodeEvent`, which alone tells a node's time.
+Reading the graph of slam_toolbox: `PoseGraph`, and `NewNodeEvent`, which has the stamps of nodes.
 
-Each PoseGraph repeats all nodes and edges; the poses of nodes move by slam_toolbox's own solver,
-and are not read. An edge is the target seen from the source. Its covariance, rows x y heading, is
-in the axes of the source, and is turned into those of the measured pose here. Versions differ:
-`relative_pose` is a Pose or a Pose2D, an event has `edge` or `edges`.
+Each PoseGraph repeats all nodes and edges. The poses of nodes are those of slam_toolbox's own
+solver and are not read. An edge is the target seen from the source. Its covariance, rows x y
+heading, is in the axes of the source and is converted to those of the measured pose. In different
+versions `relative_pose` is a Pose or a Pose2D, and an event has `edge` or `edges`.
 """
 
 from collections.abc import Iterator
@@ -31,7 +31,7 @@ NEW_NODE = 'slam_toolbox/msg/NewNodeEvent'
 
 
 class SlamToolbox(EdgeGraph):
-    """The graph of one slam_toolbox; after its reset, that of the new map alone."""
+    """The graph of one slam_toolbox; after a reset, that of the new map alone."""
 
     def _told(self, message: Any, topic: str) -> Iterator[Told]:
         if hasattr(message, 'new_node_id'):
@@ -43,7 +43,7 @@ class SlamToolbox(EdgeGraph):
             yield _told_by(edge)
 
     def _note(self, node: int, stamp: int) -> None:
-        """Note the time of a node; a number that comes again is of a map begun anew."""
+        """Store the stamp of a node; a number that has another stamp begins a new map."""
         if self._stamps.get(node, stamp) != stamp:
             self._stamps, self._edges = {}, {}
         self._stamps[node] = stamp

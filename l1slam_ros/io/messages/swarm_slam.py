@@ -7,11 +7,11 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The graph of Swarm-SLAM's robots: keyframes with their odometry, loops within and between robots.
+Reading the graph of Swarm-SLAM: keyframes with odometry, loops within and between robots.
 
-A message of a robot does not say whose it is, its topic does: `/r0/cslam/keyframe_odom`. Keyframes
-have the symbols of GTSAM: those of r0 the letter a. Of loops only those count that were a success.
-A loop is the second keyframe seen from the first, its covariance where a version has one.
+The topic of a message names its robot: `/r0/cslam/keyframe_odom`. Keyframes have the symbols of
+GTSAM as ids, with the letter a for r0. Only loops with `success` are used. A loop is the second
+keyframe, seen from the first, with a covariance in some versions.
 """
 
 import re
@@ -37,7 +37,7 @@ _ROBOTS = 26
 
 
 class SwarmSlam(EdgeGraph):
-    """The graph of all robots whose messages come."""
+    """The graph of all robots whose messages are received."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -56,14 +56,14 @@ class SwarmSlam(EdgeGraph):
                              _number(robot, message.keyframe1_id))
 
     def _step(self, message: Any, robot: int) -> Iterator[Told]:
-        """Yield the way from a robot's last keyframe to this one."""
+        """Yield the motion from a robot's last keyframe to this one."""
         sample = odometry_sample(message.odom)
         number = _number(robot, message.id)
         pose = sample.pose3[None]
         last = self._last.get(robot)
         self._stamps[number] = sample.stamp
         self._last[robot] = number, pose
-        # Where the odometry began anew, nobody knows the way.
+        # After a restart of the odometry the motion is unknown.
         if last is not None and not getattr(message, 'tracking_reset', False):
             x, y, z, *quaternion = se3.between(last[1], pose)[0].tolist()
             yield Told(last[0], number, False, SimpleNamespace(x=x, y=y, z=z),
@@ -77,14 +77,14 @@ class SwarmSlam(EdgeGraph):
         return edge.i in self._stamps and edge.j in self._stamps
 
     def sentences(self) -> list[str]:
-        """Return how many loops are of keyframes that no message has told of."""
+        """Return a sentence with the number of loops of unknown keyframes, if there are any."""
         lost = sum(edge is not None and not self._is_known(edge)
                    for edge in self._edges.values())
         return [f'{counted(lost, "loop")} of keyframes without odometry not used'] if lost else []
 
 
 def _robot_of(topic: str) -> int:
-    """Return the number of the robot of a topic, 0 where there is none in its name."""
+    """Return the number of the robot in the name of a topic; 0 if there is none."""
     found = _ROBOT.search(topic)
     return int(found[1]) if found else 0
 

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The laser scans of a bag, with the wheels at their stamps, and where the laser is on the robot.
+Reading the laser scans of a bag, the wheel odometry at their stamps, and the pose of the laser.
 
-Where that is stands in /tf_static, from the robot's frame (the `child_frame_id` of the odometry)
-to that of the scans; without, the laser is taken to be where the robot is, and that is said.
+That pose is read from /tf_static, from the robot's frame (the `child_frame_id` of the odometry) to
+that of the scans; without it the laser is taken to be at the robot's origin, with a warning.
 """
 
 import math
@@ -68,7 +68,7 @@ def read_bag_scans(path: Path, odom_topic: str, scan_topic: str) -> LaserLog:
 
 
 class _Taken:
-    """What was taken of a bag so far."""
+    """The scans, odometry and transforms that were read so far."""
 
     def __init__(self) -> None:
         self.scans: list[Scan] = []
@@ -79,7 +79,7 @@ class _Taken:
         self._transforms: dict[str, tuple[str, Array]] = {}
 
     def take(self, is_scan: bool, message: Any) -> None:
-        """Take a message; one that is none is told of once."""
+        """Add a message; the first malformed one is reported."""
         try:
             if message.topic == _STATIC:
                 for found in message.data.transforms:
@@ -99,7 +99,7 @@ class _Taken:
                 self.refused.append(sentence)
 
     def mount(self) -> tuple[Mount, tuple[str, ...]]:
-        """Return where the laser is on the robot, and what is to be said of it."""
+        """Return the pose of the laser on the robot, and sentences on it."""
         pose = se3.identity(1)
         frame = self._frame
         for _ in self._transforms:
@@ -122,7 +122,7 @@ def scan_of(message: Any) -> Scan:
 
     Raises
     ------
-    ValueError : it is no scan.
+    ValueError : it is not a scan.
 
     """
     ranges = np.asarray(message.ranges, float)

@@ -7,16 +7,16 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-CARMEN logs: text, one message a line, the logs of the field.
+Reading CARMEN logs: text with one message a line, packed by bz2 or gzip or not.
 
     FLASER n r_1 ... r_n  x y theta  odom_x odom_y odom_theta  stamp host logger_stamp
     ROBOTLASER1 type start_angle field_of_view resolution maximum_range accuracy remission_mode
         n r_1 ... r_n  m remission_1 ... remission_m  x y theta  odom_x odom_y odom_theta
         tv rv forward side axis  stamp host logger_stamp
 
-Of both kinds the more frequent one is read. n ranges [m], of FLASER over 180 degrees (the first
-and last ray half a step inside where n is even), the pose of the laser and of the robot by the
-wheels, and the message's stamp [s]. A range may be no number. Packed by bz2 or gzip, or plain.
+If a log has both kinds, the more frequent one is read. A line has n ranges [m], in FLASER over 180
+degrees (for even n the first and last ray are half a step inside), the poses of the laser and of
+the robot by wheel odometry, and the stamp of the message [s]. A range may be NaN.
 """
 
 import bz2
@@ -38,21 +38,21 @@ from l1slam_ros.io.scans.laser_log import LaserLog
 from l1slam_ros.io.scans.log_stamps import rising
 
 _OPEN: dict[str, Callable[[Path, str], Any]] = {'.bz2': bz2.open, '.gz': gzip.open}
-# [m] CARMEN's laser says so, or more, where nothing is in range.
+# [m] The laser of CARMEN gives this range, or more, if nothing is in range.
 _FAR = 80.0
-# Near the farthest range, and below it, of that range; so often at least a laser says one number.
+# Fractions of the largest range, see `_farthest`; and the least count of that range.
 _TOP = 0.98
 _BELOW = 0.88
 _OFTEN = 20
-# [m], [rad] What a laser on a robot moves on it, by rounding and because its pose is older.
+# [m], [rad] Variation of the pose of a fixed laser, by rounding and because its pose is older.
 _FIXED = np.array((0.05, 0.05, 0.05))
-# A longer line is no message of a laser.
+# A longer line is not a message of a laser.
 _LONGEST = 1 << 18
 
 
 @dataclass(frozen=True)
 class _Line:
-    """A scan, and where laser and robot were by the wheels, (3,) each."""
+    """A scan, and the poses of laser and robot by wheel odometry, (3,) each."""
 
     scan: Scan
     laser: Array
@@ -65,7 +65,7 @@ def read_carmen(path: Path) -> LaserLog:
 
     Raises
     ------
-    FileError : it cannot be read, holds no scans, or more damaged ones than others.
+    FileError : it cannot be read, holds no scans, or has more damaged ones than others.
 
     """
     damage: list[str] = []
@@ -118,10 +118,10 @@ def _log(lines: list[_Line], damage: str) -> LaserLog:
 
 def _farthest(scans: list[Scan]) -> float:
     """
-    Return from which range on nothing is in range, though no limit says so; infinite: none.
+    Return the range [m] that means "nothing in range" although no limit says so, or infinity.
 
-    Lasers say one number, the greatest, where they see nothing. Of surfaces fewer lie near the
-    farthest range than before it, and not at one distance.
+    Lasers give one value, the greatest, if they see nothing. Real surfaces near the largest range
+    are fewer than at shorter ranges, and not at one distance.
     """
     ranges = np.concatenate([scan.ranges[scan.ranges < scan.range_max] for scan in scans])
     last = ranges.max(initial=0.0)
@@ -131,7 +131,7 @@ def _farthest(scans: list[Scan]) -> float:
 
 
 def _lines(path: Path, damage: list[str]) -> Iterator[tuple[int, bytes]]:
-    """Yield the lines with their numbers; what ends a file too early is told as damage."""
+    """Yield the lines with their numbers; append to `damage` if the file ends too early."""
     opened = _OPEN.get(path.suffix.lower(), Path.open)
     number = 0
     try:
@@ -147,7 +147,7 @@ def _lines(path: Path, damage: list[str]) -> Iterator[tuple[int, bytes]]:
 
 def _flaser(words: list[bytes]) -> _Line:
     count = int(words[1])
-    # 181 rays are at whole degrees, both ends included; 180 or 360 are half a step inside.
+    # 181 rays are at whole degrees, both ends included; 180 or 360 rays are half a step inside.
     step = math.pi / (count - 1 if count % 2 else count)
     return _line(words[2:], count, -0.5 * step * (count - 1), step, _FAR, 0, 0)
 
@@ -173,7 +173,7 @@ _EXPECTED = {
 
 def _line(words: list[bytes], count: int, start: float, step: float, farthest: float, skipped: int,
           after: int) -> _Line:
-    """Return what a line says; words : from the ranges on; skipped, after : words around poses."""
+    """Parse a line; words : from the ranges on; skipped, after : numbers of words around poses."""
     first = count + skipped
     ranges = np.array(words[:count], float)
     poses = np.array(words[first : first + 6], float)

@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-An occupancy grid as nav2's map server reads it: a .pgm, and a .yaml of the same name beside it.
+Writing an occupancy grid for nav2's map server: a .pgm, and a .yaml of the same name.
 
-Rows of the picture go from the top, the greatest y, down. With `negate: 0` white is free: 254
+The first row of the picture has the greatest y. With `negate: 0` white is free: 254
 free, 205 unknown, 0 occupied.
 """
 
@@ -25,7 +25,7 @@ from l1slam_ros.io.ours import MARK, marked, refuse_others
 _FREE = 254
 _UNKNOWN = 205
 _OCCUPIED = 0
-# A shade is read as (255 - shade) / 255 occupied: 205 is .19608, which .25 would call free.
+# A shade is read as (255 - shade) / 255 occupied: 205 is .19608, which a limit of .25 calls free.
 _FREE_BELOW = 0.196
 
 
@@ -35,7 +35,7 @@ def beside(path: Path) -> Path:
 
 
 def check_grid(path: Path, inputs: list[Path], force: bool = False) -> None:
-    """Refuse, before any work is done, a grid that could not be written in the end."""
+    """Check, before any work is done, that a grid can be written."""
     if path.suffix.lower() != '.pgm':
         raise FileError(path, 'unknown suffix; expected .pgm')
     for file in (path, beside(path)):

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording has of one laser, whatever it was recorded with."""
+"""The scans of one laser in a recording of any format, with wheel odometry."""
 
 from dataclasses import dataclass
 
@@ -20,11 +20,11 @@ from l1slam_ros.core.scans.points import Mount, Scan
 @dataclass(frozen=True)
 class LaserLog:
     """
-    Scans, and the wheels.
+    Scans with wheel odometry.
 
-    scans : in the order of time; wheels : (n, 3) the robot's pose by the wheels at each; mount :
-    where the laser is on the robot; skipped : what was left out, in sentences; damage : a sentence
-    where only a part could be read, else empty
+    scans : in order of time; wheels : (n, 3) the robot's pose by wheel odometry at each; mount :
+    the pose of the laser on the robot; skipped : sentences on what was left out; damage : a
+    sentence if only a part could be read, else empty
     """
 
     scans: list[Scan]
@@ -36,7 +36,7 @@ class LaserLog:
 
 def wheels_at(stamps: Indices, poses: Array, wanted: Indices) -> tuple[Array, Indices]:
     """
-    Return where the wheels had the robot at some stamps, and which of these they surround.
+    Interpolate wheel odometry at some stamps; return the poses, and the stamps within it.
 
     Parameters
     ----------

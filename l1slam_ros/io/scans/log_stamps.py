@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps of a log as they were written -> stamps that rise, and the lines that have none."""
+"""Making the stamps of a log ascending, where its clock was set back or stamps were rounded."""
 
 from bisect import bisect_right
 
@@ -14,19 +14,19 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Indices
 
-# A clock that is behind for so many lines was set back; else a line was written late.
+# A clock that is behind for this many lines was set back; else a line was written late.
 _SET_BACK = 50
-# [ns] Between two stamps, where a log has no two that differ.
+# [ns] between two stamps of a log whose stamps are all equal.
 _USUAL = 100_000_000
 
 
 def rising(stamps: Indices) -> tuple[Indices, Indices, int]:
     """
-    Return stamps that rise, of which lines, and how far the clock was set back in all [ns].
+    Return ascending stamps, their lines, and the sum by which the clock was set back [ns].
 
-    stamps : (n,) in the order of the file [ns]. Where the clock was set back, it is taken to go on
-    from there. Of what is left, most lines are kept whose stamps do not fall: the others were
-    stamped late or early. Equal stamps are spread up to the next: they were rounded.
+    stamps : (n,) in the order of the file [ns]. If the clock was set back, later stamps are
+    shifted to undo that. Then the largest set of lines whose stamps do not descend is kept; the
+    others were stamped late or early. Equal stamps were rounded; they are spread up to the next.
     """
     going_on, back = _set_forward(stamps)
     rows = _not_falling(going_on.tolist())
@@ -34,13 +34,13 @@ def rising(stamps: Indices) -> tuple[Indices, Indices, int]:
 
 
 def _set_forward(stamps: Indices) -> tuple[Indices, int]:
-    """Return stamps by a clock that is never set back, and by how much it was [ns]."""
+    """Undo that the clock was set back; return the stamps and the sum of the shifts [ns]."""
     steps: Indices = np.diff(stamps)
     usual = int(np.median(steps[steps > 0])) if (steps > 0).any() else _USUAL
     found = stamps.copy()
     last = 0
     for at in (np.flatnonzero(steps < 0) + 1).tolist():
-        # The line before may be the one that is wrong: what counts is how long all are behind.
+        # The line before may be the wrong one, so several lines must be behind.
         before = np.sort(found[last:at])[-2:]
         behind = found[at : at + _SET_BACK] < before[0]
         if len(behind) == _SET_BACK and behind.all():
@@ -50,8 +50,8 @@ def _set_forward(stamps: Indices) -> tuple[Indices, int]:
 
 
 def _not_falling(stamps: list[int]) -> Indices:
-    """Return the most places whose stamps do not fall."""
-    # Of runs of each length the one that ends at the lowest stamp.
+    """Return the places of the longest sequence of stamps that does not descend."""
+    # For each length, the sequence that ends at the lowest stamp.
     ends: list[int] = []
     lowest: list[int] = []
     before = [-1] * len(stamps)
@@ -68,7 +68,7 @@ def _not_falling(stamps: list[int]) -> Indices:
 
 
 def _spread(stamps: Indices) -> Indices:
-    """Return stamps that do not fall with equal ones spread up to the next."""
+    """Spread equal ones of non-descending stamps up to the next stamp."""
     first = np.flatnonzero(np.diff(stamps, prepend=stamps[0] - 1))
     counts = np.diff(first, append=len(stamps))
     gaps: Indices = np.diff(stamps[first])

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever holds scans -> the graph that they make, and the points of its keyframes."""
+"""Reading scans from any recording, and making a graph and the points of its keyframes."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,12 +22,12 @@ from l1slam_ros.io.scans.to_graph import ScanMap, map_scans
 def read_scans(path: Path, odom_topic: str, scan_topic: str | None,
                report: Callable[[int, int, int], None]) -> ScanMap:
     """
-    Return what the scans of a log or a bag make.
+    Read the scans of a log or a bag, and make a graph of them.
 
     Parameters
     ----------
     odom_topic, scan_topic : of a bag
-    report : told of how many scans of how many were used, and how many loops were found
+    report : called with the number of scans used, of all scans, and of loops found
 
     Raises
     ------
@@ -47,7 +47,7 @@ def read_scans(path: Path, odom_topic: str, scan_topic: str | None,
 
 def read_log(path: Path, odom_topic: str, scan_topic: str | None) -> LaserLog:
     """
-    Return the scans of a log, or of a bag's topic, and the wheels; see `read_scans`.
+    Return the scans of a log or of a bag's topic, with wheel odometry; see `read_scans`.
 
     Raises
     ------

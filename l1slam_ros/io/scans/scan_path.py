@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Where a robot was between keyframes: the odometry of all its scans."""
+"""The poses of a robot between keyframes, by the scan-matched odometry of all scans."""
 
 from dataclasses import dataclass
 
@@ -33,7 +33,7 @@ class ScanPath:
     def steps_at(self, at: Indices, longest: int, tolerance: int
                  ) -> tuple[Indices, Indices, Array]:
         """
-        Return where the robot was at some times, seen from its keyframes.
+        Return the poses of the robot at some times, relative to its keyframes.
 
         Parameters
         ----------

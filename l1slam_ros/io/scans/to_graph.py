@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Scans -> a graph: the front end finds odometry and loops, the judgement says where it is.
+Making a graph from scans: a front end finds odometry and loops, robust solves make a map for it.
 
-In: scans in order, each with the robot's pose by the wheels. Out: the graph, to be judged and
-solved as any other. The same scans make the same graph: nothing here goes by the clock.
+In: scans in order, each with the robot's pose by wheel odometry. Out: the graph, to be judged and
+solved like any other. The same scans make the same graph: nothing here depends on the clock.
 """
 
 from collections.abc import Callable, Iterable
@@ -34,13 +34,13 @@ from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.scans.scan_path import ScanPath
 
-# The map is made anew for each loop while there are few, later for so much more of them.
+# The map is solved anew for each loop while there are few, later when they grew by this fraction.
 _MORE_LOOPS = 0.1
 
 
 @dataclass(frozen=True)
 class ScanMap:
-    """The graph that scans make, what each of its keyframes saw, and the way of all scans."""
+    """A graph made from scans, the points of its keyframes, and the poses of all scans."""
 
     record: GraphRecord
     points: list[Points]
@@ -51,13 +51,13 @@ def map_scans(scans: Iterable[tuple[Scan, Array]], mount: Mount,
               report: Callable[[int, int], None] = lambda scans, loops: None,
               options: FrontEndOptions = FrontEndOptions()) -> ScanMap:  # noqa: B008
     """
-    Return the graph that scans make, and the points of its keyframes.
+    Make a graph from scans; return it with the points of its keyframes.
 
     Parameters
     ----------
-    scans : each with the robot's pose by the wheels at its stamp, (3,); stamps rise
-    mount : where the laser is on the robot
-    report : told how many scans and loops there were, with each keyframe
+    scans : each with the robot's pose by wheel odometry at its stamp, (3,); stamps ascend
+    mount : the pose of the laser on the robot
+    report : called at each keyframe with the numbers of scans and of loops so far
     options : of the front end
 
     """
@@ -98,12 +98,12 @@ class _Making:
         self._last: list[int] = []
 
     def begin_drive(self, mount: Mount) -> None:
-        """Let the next scan be of another drive."""
+        """Begin another drive with the next scan."""
         self._drive += 1
         self._front_end.begin_drive(mount)
 
     def take(self, scan: Scan, wheels: Array) -> bool:
-        """Take a scan; tell whether it is a keyframe."""
+        """Add a scan; return whether it became a keyframe."""
         step = self._front_end.add(scan, wheels)
         if step.said:
             self._said.append(step.said)
@@ -119,7 +119,7 @@ class _Making:
         return step.keyframe is not None
 
     def _append(self, step: Step) -> None:
-        """Append the newest keyframe, and its odometry where it goes on from the one before."""
+        """Append the newest keyframe, and its odometry if it continues from the one before."""
         keyframes = self._front_end.keyframes
         if len(keyframes) < 2 or keyframes[-1].part != keyframes[-2].part:
             self._graph.add_poses(1, self._drive)
@@ -135,7 +135,7 @@ class _Making:
                 root_of_inverse(loop.covariance[None]))
 
     def finished(self) -> ScanMap:
-        """Return what was made; no scan comes any more."""
+        """Return the result; no more scans can be added."""
         self._add(self._front_end.last_loops())
         keyframes = self._front_end.keyframes
         stamps = np.array([keyframe.stamp for keyframe in keyframes], np.int64)
@@ -148,7 +148,7 @@ class _Making:
 
 
 def _mapped(graph: FactorGraph) -> tuple[Array, Array]:
-    """Return the map, and how certain it is; see `ScanFrontEnd.place`."""
+    """Return the map and its uncertainty; see `ScanFrontEnd.place`."""
     judgement, poses = robust_solve(graph)
     part = judgement.believed(graph)
     unknown = np.full((len(poses), 2), np.inf)

@@ -6,14 +6,15 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What `scan_loops` says of itself on /diagnostics, once a second."""
+"""The diagnostics of `scan_loops`, published once a second."""
 
 from collections import Counter, deque
 from collections.abc import Mapping
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 
+from l1slam_ros.ros.diagnostics import array_of, status_of, traffic_values
 from l1slam_ros.ros.scans.front_end_thread import FrontEndThread
 from l1slam_ros.ros.scans.map_drawer import MapDrawer
 from l1slam_ros.ros.threads.failures import Failures
@@ -31,11 +32,11 @@ class ScanDiagnostics:
 
     Parameters
     ----------
-    node : whose name and clock it speaks with
-    topics : name -> how its messages come
+    node : to publish with
+    topics : name -> the traffic on it
     front_end : whose state
     drawer : of the map
-    failures : what fails now
+    failures : the failures that last
 
     """
 
@@ -55,11 +56,9 @@ class ScanDiagnostics:
         lost = queue.counts.copy() + front_end.refused.copy()
         lately = lost - self._minute[0]
         self._minute.append(Counter(lost))
-        values: dict[str, object] = {
-            f'{topic}.{name}': value for topic, traffic in self._topics.items()
-            for name, value in traffic.values().items()}
-        values |= {name: front_end.run.counts[name]
-                   for name in ('scans', 'keyframes', 'parts', 'loops', 'comparisons')}
+        values = traffic_values(self._topics) | {
+            name: front_end.run.counts[name]
+            for name in ('scans', 'keyframes', 'parts', 'loops', 'comparisons')}
         values['waiting'] = queue.waiting
         values |= {f'refused.{cause}': count for cause, count in sorted(lost.items())}
         median, most = front_end.run.cost()
@@ -67,17 +66,13 @@ class ScanDiagnostics:
                    'map.cells': self._drawer.cells}
         level, sentence = self._judgement(lately)
         name = self._node.get_fully_qualified_name()
-        message = DiagnosticArray(status=[DiagnosticStatus(
-            level=level, name=f'{name}: scans', message=sentence, hardware_id=name,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(message)
+        self._publisher.publish(array_of(self._node, [
+            status_of(name, f'{name}: scans', level, sentence, values)]))
 
     def _judgement(self, lately: Counter[str]) -> tuple[bytes, str]:
-        """Return the level and all that is wrong now, in one sentence."""
-        if failures := self._failures.lasting:
-            return DiagnosticStatus.ERROR, '; '.join(
-                f'{what} failed: {why}' for what, why in failures.items())
+        """Return the level, and a sentence with all that is wrong now."""
+        if failing := self._failures.sentence:
+            return DiagnosticStatus.ERROR, failing
         wrong = []
         if lately:
             wrong.append('messages not used in the last minute: ' + ', '.join(

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The thread that does all the work of `scan_loops`: scans first, the map when there are none."""
+"""The thread that does all the work of `scan_loops`: scans first, the grid when none waits."""
 
 import threading
 import time
@@ -38,7 +38,7 @@ from l1slam_ros.ros.scans.scan_odometry import IncrementalOdometry
 from l1slam_ros.ros.scans.scan_queue import ScanQueue
 from l1slam_ros.ros.threads.failures import Failures
 
-# So many messages are kept until there is time for them.
+# Largest number of messages that wait for this thread.
 _BACKLOG = 20_000
 # [s] So often, at most, the path is read while there is nothing else to do, and where there is a
 # new keyframe; and the map looked at. To read it takes as long as some scans do.
@@ -48,17 +48,17 @@ _LOOK = 0.1
 _REPEAT_WARNING = 5.0  # [s]
 # [s] Pause after an error, so that one which recurs does not keep a core busy.
 _BREATH = 0.05
-# Costs of so many scans are kept.
+# Number of scans whose costs are kept.
 _COSTS = 1000
 
 
 class RunOfScans:
     """
-    Follows the robot from scan to scan, publishes what comes of it, and has the map drawn.
+    Matches scan after scan, publishes odometry and loops, and has the grid drawn.
 
     Parameters
     ----------
-    options : returns them as they are now
+    options : returns the current options
     frames : of the robot
     publisher : of odometry and loops
     drawer : of the map
@@ -66,7 +66,7 @@ class RunOfScans:
 
     Attributes
     ----------
-    counts : of what has been made
+    counts : numbers of scans, keyframes, loops and so on
     costs : of the last scans [s]
 
     """
@@ -82,7 +82,7 @@ class RunOfScans:
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        """Begin with no scan seen."""
+        """Begin without any scan."""
         options = self._options()
         self._front_end = ScanFrontEnd(options, self._frames.mount or Mount())
         self._odometry = IncrementalOdometry(options.keyframe)
@@ -96,11 +96,11 @@ class RunOfScans:
         self._path = data
 
     def add_known(self, stamp: int, covariance: Array) -> None:
-        """Hear how well a pose of the path is known, (3, 3) at its stamp [ns]."""
+        """Add the covariance (3, 3) of a pose of the path at its stamp [ns]."""
         self._placing.add_known(stamp, covariance)
 
     def follow(self, scan: Scan, wheels: Array) -> None:
-        """Follow the robot to a scan, the wheels being at a pose (3,); publish what came of it."""
+        """Match a scan, with wheel odometry at a pose (3,), and publish the result."""
         began = time.thread_time()
         keyframes = self._front_end.keyframes
         before = keyframes[-1].part if keyframes else 0
@@ -113,13 +113,13 @@ class RunOfScans:
         self._warn(step, begins)
         if step.keyframe is not None:
             self.place_if_due(_FRESH)
-        # Comparisons of keyframes wait for each other: a few are made with each scan.
+        # Comparisons of keyframes are queued; a few are made with each scan.
         self.look_for_loops()
         self.counts['scans'] += 1
         self.costs.append(time.thread_time() - began)
 
     def look_for_loops(self) -> bool:
-        """Look for loops for a moment; return whether there is more to look for now."""
+        """Search for loops for a moment; return whether comparisons are left."""
         for loop in self._front_end.loops():
             self._publisher.loop(self._frames.base, self._front_end.keyframes, loop)
             self.counts['loops'] += 1
@@ -127,12 +127,12 @@ class RunOfScans:
         return self._front_end.waiting > 0
 
     def place_if_due(self, seconds: float = _READ) -> None:
-        """Read a path that has come, if the one before was some seconds ago."""
+        """Use a new path if the last one was used `seconds` ago or earlier."""
         if self._path and time.monotonic() - self._read > seconds:
             self._place()
 
     def cost(self) -> tuple[float, float]:
-        """Return what the last scans cost, median and 99% quantile [s] of a core."""
+        """Return the processor time of the last scans, median and 99% quantile [s]."""
         median, most = np.quantile(list(self.costs) or [0.0], (0.5, 0.99)).tolist()
         return median, most
 
@@ -149,7 +149,7 @@ class RunOfScans:
         self.counts['comparisons'] = self._front_end.waiting
 
     def _place(self) -> None:
-        """Let front end and map know where the path has the keyframes."""
+        """Give the poses of the keyframes in the path to the front end and the grid."""
         self._placing.set_path(*path_in(self._path))
         self._path = b''
         self._read = time.monotonic()
@@ -168,23 +168,23 @@ class RunOfScans:
 
 class FrontEndThread:
     """
-    Takes messages in the order they came, and follows the robot with them.
+    Uses messages in the order of their arrival.
 
     Parameters
     ----------
     node : to log with
-    options : returns them as they are now
+    options : returns the current options
     publisher : of odometry and loops
     drawer : of the map
-    failures : where to tell what nobody foresaw
-    static : whether /tf_static is heard
+    failures : records unexpected errors
+    static : whether /tf_static is subscribed to
 
     Attributes
     ----------
-    refused : cause -> how many messages could not be used
+    refused : cause -> number of messages that could not be used
     queue : the scans that wait
-    run : the scans that were used
-    ready : whether its loops are compiled
+    run : the matching of scans
+    ready : whether the compiled loops are ready
 
     """
 
@@ -211,7 +211,7 @@ class FrontEndThread:
         self._thread.start()
 
     def put(self, topic: str, data: bytes) -> None:
-        """Leave a serialised message; any thread may call it."""
+        """Queue a serialised message; any thread may call this."""
         self._inbox.append((topic, data))
         self._woken.set()
 
@@ -242,7 +242,7 @@ class FrontEndThread:
                 time.sleep(_BREATH)
 
     def _turn(self) -> bool:
-        """Do the next thing there is to do; return whether there may be more."""
+        """Do the next piece of work; return whether there may be more."""
         while self._inbox:
             topic, data = self._inbox.popleft()
             try:

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""`map` and `~/save_map`: the occupancy grid of the scans, where the optimised path has them."""
+"""`map` and `~/save_map`: the occupancy grid of the scans at the optimised keyframes."""
 
 import threading
 import time
@@ -28,22 +28,22 @@ from l1slam_ros.io.scans.grid_file import write_grid
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
 from l1slam_ros.ros.shell.header import header
 
-# [s] Scans wait no longer for the map.
+# [s] Longest time for which drawing delays a scan.
 _SLICE = 0.01
 
 
 class MapDrawer:
     """
-    Draws a map a little at a time, and publishes it when it is whole again.
+    Draws a grid a little at a time, and publishes it when it is complete.
 
     Parameters
     ----------
     node : to publish from
-    options : returns them as they are now
+    options : returns the current options
 
     Attributes
     ----------
-    cells : of the map that was published last, for diagnostics
+    cells : number of cells of the last published grid, for the diagnostics
 
     """
 
@@ -56,7 +56,7 @@ class MapDrawer:
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        """Forget all that is drawn."""
+        """Begin with an empty grid."""
         with self._lock:
             self._grid = LiveGrid(self._options().map_resolution)
             self._frame = 'map'
@@ -67,7 +67,7 @@ class MapDrawer:
             self._due = 0.0
 
     def follow(self, frame: str, stamp: int, placed: dict[int, tuple[Points, Array]]) -> None:
-        """Hear where keyframes lie, by their numbers; stamp : of the newest [ns]."""
+        """Set the points and poses of keyframes, by number; stamp : of the newest [ns]."""
         with self._lock:
             for keyframe in self._wanted.keys() - placed.keys():
                 self._grid.erase(keyframe)
@@ -79,7 +79,7 @@ class MapDrawer:
                              if not self._grid.is_as_drawn(keyframe, pose)]
 
     def work(self) -> bool:
-        """Draw for a moment, or publish what is due; return whether there is more to draw."""
+        """Draw for a moment, or publish if due; return whether there is more to draw."""
         with self._lock:
             self._draw(time.monotonic() + _SLICE)
             if self._to_draw:
@@ -92,11 +92,11 @@ class MapDrawer:
 
     def save(self) -> str:
         """
-        Write the map; return what is to be said of it.
+        Write the grid; return a sentence for the answer.
 
         Raises
         ------
-        OptionError : no file is named, or there is no map yet.
+        OptionError : `map_path` is empty, or there is no grid yet.
         FileError : it cannot be written.
 
         """

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of `scan_loops` -> records, and back."""
+"""Converting the messages of `scan_loops` to records, and covariances back."""
 
 import math
 import struct
@@ -24,7 +24,7 @@ from l1slam_ros.core.scans.points import Scan
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.messages.conversion import stamp_of
 
-# Fewer rays are no scan, more no laser.
+# Least and largest number of rays of a scan.
 _FEWEST, _MOST = 2, 100_000
 _LITTLE_ENDIAN = b'\0\1'
 _ROWS = np.array(se2.COVARIANCE_ROWS)
@@ -32,11 +32,11 @@ _ROWS = np.array(se2.COVARIANCE_ROWS)
 
 def scan_in(message: Any, range_max: float) -> Scan:
     """
-    Return what a sensor_msgs/LaserScan says; range_max : [m] besides its own, 0: that alone.
+    Convert a sensor_msgs/LaserScan; range_max : [m] a limit besides its own, 0: none.
 
     Raises
     ------
-    MessageError : its stamp is none, or it holds no rays.
+    MessageError : its stamp is invalid, or it has no rays.
 
     """
     stamp, count = stamp_of(message.header), len(message.ranges)
@@ -58,8 +58,8 @@ def path_in(data: bytes) -> tuple[str, Indices, Array]:
     """
     Return frame, stamps (n,) [ns] and poses (n, 3) of a serialised nav_msgs/Path.
 
-    By its layout where that is as `path_bytes` has it: rclpy takes some hundred times as long to
-    make the objects of a message, and a path comes with each update, whole.
+    It is read by its layout if that is the one of `path_bytes`: rclpy's deserialisation takes some
+    hundred times as long, and each update sends the whole path.
     """
     with suppress(struct.error, ValueError):
         if (found := _path_parts(data)) is not None:
@@ -75,7 +75,7 @@ def path_in(data: bytes) -> tuple[str, Indices, Array]:
 
 
 def _path_parts(data: bytes) -> tuple[str, Indices, Array] | None:
-    """Return frame, stamps and poses (n, 7) of a path; None: its poses have no one layout."""
+    """Return frame, stamps and poses (n, 7) of a path; None if its poses differ in layout."""
     if bytes(data[:2]) != _LITTLE_ENDIAN:
         return None
     (length,) = struct.unpack_from('<I', data, 12)
@@ -105,7 +105,7 @@ def covariance_in(message: Any) -> tuple[int, Array]:
 
     Raises
     ------
-    MessageError : its stamp is none, or it holds no covariance.
+    MessageError : its stamp or its covariance is invalid.
 
     """
     stamp = stamp_of(message.header)
@@ -116,7 +116,7 @@ def covariance_in(message: Any) -> tuple[int, Array]:
 
 
 def whole(covariance: Array) -> Array:
-    """Return a covariance (3, 3) of the plane as messages have it, (6, 6)."""
+    """Return the covariance (6, 6) of a message for one of the plane, (3, 3)."""
     found = np.zeros((6, 6))
     found[_ROWS[:, None], _ROWS] = covariance
     return found

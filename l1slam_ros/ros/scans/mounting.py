@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The frames of the robot, and where the laser is in them: as an option or /tf_static says."""
+"""The frames of the robot, and the pose of the laser, from an option or from /tf_static."""
 
 import time
 from collections.abc import Callable
@@ -21,22 +21,22 @@ from l1slam_ros.core.scans.points import Mount
 from l1slam_ros.io.messages.conversion import checked_pose3
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
 
-# [s] How long /tf_static may take to say where the laser is.
+# [s] How long to wait for the pose of the laser on /tf_static.
 _MOUNTING = 2.0
-# More links from a laser to a robot are a circle.
+# More links than this from a laser to a robot are a cycle.
 _LINKS = 100
-# A laser whose axis is farther off the vertical than by this cosine sees no floor plan.
+# Least cosine between the axis of the laser and the vertical: else the scans are no floor plan.
 _LEVEL = 0.9
 
 
 class StaticTransforms:
-    """What has been heard of /tf_static: each frame's pose in its parent."""
+    """The content of /tf_static: each frame's pose in its parent."""
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Array]] = {}
 
     def add(self, message: Any) -> None:
-        """Take in a tf2_msgs/TFMessage; what is no transform of it is left out."""
+        """Add a tf2_msgs/TFMessage; malformed transforms are left out."""
         for one in message.transforms:
             try:
                 pose3 = checked_pose3(one.transform.translation, one.transform.rotation)
@@ -47,11 +47,11 @@ class StaticTransforms:
 
     def mount(self, base: str, laser: str) -> Mount | None:
         """
-        Return where a laser's frame is in that of the robot; None: nobody has said so.
+        Return the pose of a laser's frame in that of the robot; None if it is unknown.
 
         Raises
         ------
-        MessageError : the laser does not look along a floor.
+        MessageError : the laser does not scan parallel to the floor.
 
         """
         pose = se3.from_pose3(np.array([[0.0, 0, 0, 0, 0, 0, 1]]))
@@ -68,13 +68,13 @@ class StaticTransforms:
 
 class RobotFrames:
     """
-    The names of the robot's frames as messages give them, and where the laser is.
+    The names of the robot's frames, from messages, and the pose of the laser.
 
     Parameters
     ----------
-    options : returns them as they are now
+    options : returns the current options
     logger : to say where the laser is
-    static : whether /tf_static is heard
+    static : whether /tf_static is subscribed to
 
     Attributes
     ----------
@@ -92,17 +92,17 @@ class RobotFrames:
         self.wheels = ''
         self.laser = ''
         self.mount: Mount | None = None
-        # [s] When it was first asked where the laser is.
+        # [s] When the pose of the laser was first looked for.
         self._asked = 0.0
 
     def hear_static(self, message: Any) -> None:
-        """Take in a tf2_msgs/TFMessage of /tf_static."""
+        """Add a tf2_msgs/TFMessage of /tf_static."""
         if self._transforms is not None:
             self._transforms.add(message)
 
     def hear_odometry(self, wheels: str, child: str) -> None:
         """
-        Take in the two frames of an odometry message; the first one names the robot's.
+        Set the two frames of an odometry message; the first message names the robot's frame.
 
         Raises
         ------
@@ -118,11 +118,11 @@ class RobotFrames:
 
     def find_mount(self) -> bool:
         """
-        Find out where the laser is, once; return whether it was found in this call.
+        Look for the pose of the laser; return whether it was found in this call.
 
         Raises
         ------
-        MessageError : the laser does not look along a floor.
+        MessageError : the laser does not scan parallel to the floor.
 
         """
         if self.mount is not None or not self.laser or not self.base:
@@ -150,7 +150,7 @@ class RobotFrames:
 
 
 def _mount(laser: str, pose3: Array) -> Mount:
-    """Return the mount at a pose (7,): by where the laser's x and z axes point."""
+    """Return the mount of a laser at a pose (7,), from the directions of its x and z axes."""
     x, y, z, w = pose3[3:]
     ahead = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
     up = 1 - 2 * (x * x + y * y)

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-`scan_loops`: scans and the wheels in, scan-matched odometry, loops and the occupancy map out.
+The node `scan_loops`: scans and wheel odometry in; scan-matched odometry, loops and a grid out.
 
-One thread takes messages in and does no more than that; one does all the work, scans first; one
-writes the map when a service asks for it.
+One thread receives messages, one does all the work, scans first, and one writes the grid when the
+service asks for it.
 """
 
 from typing import Any
@@ -54,7 +54,7 @@ _AT_START = ('keyframe.', 'loop.')
 
 class ScanLoopsNode(Node):
     """
-    The ROS face of `core.scans.front_end.ScanFrontEnd`.
+    The ROS node around `core.scans.front_end.ScanFrontEnd`.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class ScanLoopsNode(Node):
         if TFMessage is not None:
             self._hear(TFMessage, '/tf_static', _STATIC)
         self._jobs = JobQueue(self, self.failures, lambda: None)
-        # A group of its own: a service that awaits its answer would block its whole group.
+        # A callback group of its own: a service that awaits its result blocks its group.
         self.create_service(Trigger, '~/save_map', self._save_map,
                             callback_group=ReentrantCallbackGroup())
         self._diagnostics = ScanDiagnostics(
@@ -102,7 +102,7 @@ class ScanLoopsNode(Node):
 
     @property
     def options(self) -> ScanLoopsOptions:
-        """The options as they are now."""
+        """The current options."""
         return self._declared.options
 
     def close(self, seconds: float = 60.0) -> bool:
@@ -114,11 +114,11 @@ class ScanLoopsNode(Node):
         return ended
 
     def is_saving(self) -> bool:
-        """Return whether a map is being saved: never one that nobody waits for."""
+        """Return whether the end of the node has to wait for a save: never."""
         return False
 
     def _hear(self, kind: Any, topic: str, qos: QoSProfile) -> None:
-        """Leave the messages of a topic to the front end, as bytes."""
+        """Subscribe to a topic, and give its messages to the front end, serialised."""
         def take(data: bytes, information: Any) -> None:
             traffic.note(information)
             self._front_end.put(topic, data)

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What `scan_loops` can be told."""
+"""The options of `scan_loops`."""
 
 import math
 from collections.abc import Iterable
@@ -18,13 +18,13 @@ from l1slam_ros.core.options import option
 from l1slam_ros.core.scans.front_end import FrontEndOptions
 from l1slam_ros.core.scans.points import Mount
 
-# [rad] A roll of nothing or of half a turn, as people write it.
+# Tolerance of the sine of the roll, which is 0 or half a turn.
 _ROLL = 0.01
 
 
 @dataclass(frozen=True)
 class ScanLoopsOptions(FrontEndOptions):
-    """Everything the node can be told: the front end's options and its own."""
+    """All options of the node: those of the front end, and its own."""
 
     PASSED_OVER = OF_ROS
 
@@ -56,7 +56,7 @@ class ScanLoopsOptions(FrontEndOptions):
         '', 'the .pgm file that ~/save_map writes; its .yaml is written beside it')
 
     def __post_init__(self) -> None:
-        """Check every field; a pose may be a list, as ROS has it, or its text."""
+        """Check every field; the laser's pose may be a list, as in ROS, or text."""
         if not isinstance(self.laser_pose, str) and isinstance(self.laser_pose, Iterable):
             object.__setattr__(self, 'laser_pose', ', '.join(map(str, self.laser_pose)))
         super().__post_init__()
@@ -71,11 +71,11 @@ class ScanLoopsOptions(FrontEndOptions):
 
     def mount(self) -> Mount | None:
         """
-        Return where the laser is by these options; None: they do not say.
+        Return the pose of the laser by these options; None if `laser_pose` is empty.
 
         Raises
         ------
-        OptionError : `laser_pose` is no pose.
+        OptionError : `laser_pose` is not a pose.
 
         """
         words = self.laser_pose.strip('[]() ').replace(',', ' ').split()

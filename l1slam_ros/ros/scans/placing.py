@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Where the keyframes of the scans lie in the optimised map, and how well that is known.
+The poses of the scans' keyframes in the optimised map, and their uncertainty.
 
-In: the back end's `path` and `pose_with_covariance`, by stamps, and the scan-matched odometry. The
-back end's keyframes need not be those of the scans: from the nearest one before, odometry goes on.
+In: the back end's `path` and `pose_with_covariance`, and the scan-matched odometry. The back end's
+keyframes need not be those of the scans: odometry leads on from the nearest one before.
 """
 
 from bisect import bisect_left, bisect_right
@@ -23,7 +23,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.scans.submaps import Keyframe
 
-# [m] The back end knows nothing of a keyframe that it says so little of.
+# [m] A standard deviation beyond this means that the pose is unknown.
 _UNKNOWN = 100.0
 
 
@@ -46,20 +46,20 @@ class Placing:
         self._known: list[tuple[int, float, float]] = []
 
     def add_odometry(self, stamp: int, pose: Array) -> None:
-        """Hear where the robot was by its scans, (3,), in their frame; stamps [ns] rise."""
+        """Add a pose (3,) of the scan-matched odometry; stamps [ns] ascend."""
         self._stamps.extend(np.array([stamp]))
         self._odometry.extend(pose[None])
 
     def set_path(self, frame: str, stamps: Indices, poses: Array) -> None:
-        """Hear the path: its frame, stamps (n,) [ns], poses (n, 3)."""
+        """Set the path: its frame, stamps (n,) [ns], poses (n, 3)."""
         self.frame = frame
-        # Where stamps go back, what comes before is of another time.
+        # If stamps go back, the part before is of another time.
         back = np.flatnonzero(np.diff(stamps) <= 0)
         first = int(back[-1]) + 1 if len(back) else 0
         self._path = stamps[first:], poses[first:]
 
     def add_known(self, stamp: int, covariance: Array) -> None:
-        """Hear how well a pose of the path is known from the first one, (3, 3) at its stamp."""
+        """Add the covariance (3, 3) of a pose relative to the first one, at its stamp [ns]."""
         metres = float(np.sqrt(max(covariance[0, 0] + covariance[1, 1], 0.0)))
         radians = float(np.sqrt(max(covariance[2, 2], 0.0)))
         row = bisect_left(self._known, (stamp,))
@@ -67,7 +67,7 @@ class Placing:
         self._known[row : row + replaced] = [(stamp, metres, radians)]
 
     def place(self, keyframes: Sequence[Keyframe]) -> Array:
-        """Return where the first keyframes lie in the map, (n, 3): as many as the path reaches."""
+        """Return the poses of keyframes in the map, (n, 3), as far as the path reaches."""
         stamps, poses = self._path
         if not len(stamps) or not len(self._stamps):
             return np.zeros((0, 3))
@@ -79,7 +79,7 @@ class Placing:
 
     def spread(self, keyframes: Sequence[Keyframe]) -> Array:
         """
-        Return how far each keyframe may lie off as the last of them sees it, (n, 2) [m], [rad].
+        Return the standard deviation of each keyframe relative to the last, (n, 2) [m], [rad].
 
         Each is known from the first one as well as when it was the newest, or better since, and so
         is the last; both errors are taken to have nothing in common, where in truth they share
@@ -96,9 +96,9 @@ class Placing:
 
     def joined(self, keyframes: Sequence[Keyframe]) -> set[int]:
         """
-        Return the parts of the run whose place in the map is known: the first, and those joined.
+        Return the parts of the drive whose pose in the map is known: the first and those joined.
 
-        Of a part that nothing joins, the back end publishes covariances, too; they are huge.
+        The back end publishes covariances of unjoined parts, too; they are huge.
         """
         found = {keyframes[0].part} if keyframes else set()
         stamps = [keyframe.stamp for keyframe in keyframes]
@@ -108,7 +108,7 @@ class Placing:
         return found
 
     def _at(self, times: Indices) -> Array:
-        """Return the poses of the scan-matched odometry at some times [ns], (m, 3)."""
+        """Interpolate the scan-matched odometry at some times [ns], (m, 3)."""
         stamps, poses = self._stamps.view(), self._odometry.view()
         if len(stamps) == 1:
             return np.repeat(poses, len(times), axis=0)

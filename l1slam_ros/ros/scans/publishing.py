@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""`scan_odom`, `loop_closures` and, where tf2_msgs is installed, where the wheels' frame is."""
+"""Publishing `scan_odom`, `loop_closures` and, with tf2_msgs, the frame of the wheel odometry."""
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -28,13 +28,13 @@ try:
 except ImportError:  # the ROS wheels on PyPI have none
     TFMessage = None
 
-# [ns] A transform is stamped so far ahead: until the next scan is matched, it is the newest.
+# [ns] How far a transform is stamped ahead, as it is the newest until the next scan is matched.
 _AHEAD = NANOSECONDS // 5
 
 
 class ScanPublisher:
     """
-    Publishes what the front end finds.
+    Publishes the results of the front end.
 
     Parameters
     ----------

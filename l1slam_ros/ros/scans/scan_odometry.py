@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-`scan_odom`: what each scan says of the robot's motion since the one before.
+The covariance of `scan_odom`: the motion of the robot from scan to scan.
 
 The front end knows how certain the motion from the last keyframe to each scan is, and the errors
 of scans that are matched with one map do not add up. A message states what `covariance_source:
@@ -27,15 +27,15 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.measurements import FASTEST
 from l1slam_ros.core.scans.odometry import ScanKeyframes, Step
 
-# [m^2, rad^2] Least that a message states, of a robot that stands.
+# [m^2, rad^2] Least variance of a message, for a robot that stands.
 _LEAST = 1e-8 * np.eye(3)
-# [m] A new part is so far off, at least, and so many times as far as anything goes.
+# [m] Least shift of a new part; and the shift as a multiple of what anything can move.
 _APART, _FARTHER = 1000.0, 2.0
 
 
 class IncrementalOdometry:
     """
-    Makes of the front end's steps what `scan_odom` states.
+    Converts the steps of the front end to poses and covariances of `scan_odom`.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class IncrementalOdometry:
 
 
 def _positive(matrix: Array) -> Array:
-    """Return the part of a symmetric matrix that is no less than nothing."""
+    """Return the positive semidefinite part of a symmetric matrix."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     found: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return found

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Scans that wait for odometry on both sides of their stamps, and for their turn.
+A queue of scans that wait for odometry before and after their stamps, and for their turn.
 
-In: scans and the wheels' poses, each in the order of its stamps. Out: a scan with the wheels' pose
-at its stamp. Who takes them too slowly gets every other one, and those left out are counted.
+In: scans and poses of wheel odometry, in the order of their stamps. Out: scans with the pose at
+their stamps. If they are taken too slowly, every other one is dropped and counted.
 """
 
 from collections import Counter, deque
@@ -22,19 +22,19 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.points import Scan
 
-# So many scans and poses may wait for each other: seconds of a fast laser, of fast wheels.
+# Largest numbers of scans and poses that wait for each other: some seconds of fast sensors.
 _MOST_SCANS, _MOST_POSES = 100, 5000
-# [ns] Stamps that go back so far are of another time; nearer, one message came late.
+# [ns] Stamps that go back by more are of another time; otherwise a message came late.
 _BACK = 500_000_000
 
 
 class ScanQueue:
     """
-    Pairs scans with the wheels; one thread uses it.
+    Pairs scans with wheel odometry, for a single thread.
 
     Parameters
     ----------
-    backlog : returns how many scans may wait for their turn; of more, every other one is left out
+    backlog : returns the number of scans that may wait for their turn, see above
 
     Attributes
     ----------
@@ -55,11 +55,11 @@ class ScanQueue:
 
     @property
     def waiting(self) -> int:
-        """How many scans wait for odometry."""
+        """Number of scans that wait for odometry."""
         return len(self._scans)
 
     def add_wheels(self, stamp: int, pose: Array) -> None:
-        """Take in a pose (3,) of the wheels at a stamp [ns]."""
+        """Add a pose (3,) of wheel odometry at a stamp [ns]."""
         if self._wheels and stamp <= self._wheels[-1][0]:
             if not self._went_back(stamp):
                 self.counts['old_stamp'] += 1
@@ -72,31 +72,31 @@ class ScanQueue:
         self._wheels.append((stamp, pose))
 
     def _went_back(self, stamp: int) -> bool:
-        """Tell whether time went back: two stamps in a row are of an earlier time, and rise."""
+        """Tell whether time went back: two stamps in a row are much earlier, and ascend."""
         before = self._back
         self._back = stamp
         return 0 < before < stamp <= self._wheels[-1][0] - _BACK
 
     def add_scan(self, scan: Scan) -> None:
-        """Take in a scan."""
+        """Add a scan."""
         if scan.stamp <= self._newest:
             if self._newest - scan.stamp < _BACK:
                 self.counts['old_stamp'] += 1
                 return
-            # Another time, of which the wheels will tell, too.
+            # Another time; the stamps of the wheel odometry will go back, too.
             self._scans.clear()
         self._newest = scan.stamp
         self._scans.append(scan)
-        # Where wheels have come, scans wait for their turn alone.
+        # Scans here wait for odometry; later they wait only for their turn.
         if len(self._scans) > max(_MOST_SCANS, self._backlog()):
             self._scans.popleft()
             self.counts['expired'] += 1
 
     def take(self, wait: float) -> tuple[Scan, Array] | None:
         """
-        Return the next scan and the wheels' pose (3,) at its stamp; None: there is none.
+        Return the next scan and the pose (3,) of the wheels at its stamp; None if there is none.
 
-        wait : [s] a scan waits so long for odometry, by the stamps of later ones
+        wait : [s] how long a scan waits for odometry, by the stamps of later scans
         """
         longest = int(wait * 1e9)
         while self._scans:
@@ -110,13 +110,13 @@ class ScanQueue:
             else:
                 self._ready.append((scan, found))
         if (waiting := len(self._ready)) > self._backlog():
-            # The newest stays; scans that lie evenly along the way are followed more surely.
+            # The newest stays; scans that are evenly spaced are easier to match.
             self._ready = deque([*self._ready][(waiting - 1) % 2 :: 2])
             self.counts['left_out'] += waiting - len(self._ready)
         return self._ready.popleft() if self._ready else None
 
     def _at(self, stamp: int, longest: int) -> Array | None:
-        """Return the wheels' pose (3,) at a stamp; None: it is not known."""
+        """Return the pose (3,) of the wheels at a stamp; None if it is unknown."""
         wheels = self._wheels
         while len(wheels) > 1 and wheels[1][0] <= stamp:
             wheels.popleft()
@@ -132,7 +132,7 @@ class ScanQueue:
         return se2.interpolate(first[None], last[None], fraction)[0]
 
     def _may_come(self, stamp: int, longest: int) -> bool:
-        """Tell whether odometry may still come that surrounds a stamp."""
+        """Tell whether odometry before and after a stamp may still come."""
         if self._newest - stamp > longest:
             return False
         return not self._wheels or self._wheels[-1][0] < stamp

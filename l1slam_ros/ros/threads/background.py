@@ -6,22 +6,22 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Threads that make way for the one that answers messages."""
+"""Threads with less priority than the one that receives messages."""
 
 import os
 import sys
 import threading
 from collections.abc import Callable
 
-# A core that both want goes to messages at three to one. With much more, on a machine that others
-# keep busy, a thread that holds Python's lock would seldom come to run, and messages wait for it.
+# With this niceness messages get three quarters of a shared core. With a higher one, on a busy
+# machine, a thread that holds Python's lock would seldom run, and messages would wait for it.
 _NICE = 5
 
 
 def background(name: str, work: Callable[[], None]) -> threading.Thread:
-    """Return a thread that does some work with less priority, as do the threads it starts."""
+    """Return a thread that does some work with less priority, which its threads inherit."""
     def run() -> None:
-        if sys.platform == 'linux':  # elsewhere it is the whole process that would be nice
+        if sys.platform == 'linux':  # elsewhere it would apply to the whole process
             os.nice(_NICE)
         work()
 

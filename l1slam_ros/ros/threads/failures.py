@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What goes wrong in the node: told once in full, then remembered for as long as it lasts."""
+"""Failures in the node: logged once in full, then kept for as long as they last."""
 
 import math
 import time
@@ -17,20 +17,20 @@ from typing import Any
 
 from l1slam_ros.core.errors import L1SlamError
 
-_REPEAT = 5.0  # [s] the log repeats a failure no more often
+_REPEAT = 5.0  # [s] shortest time between two log lines about one failure
 
 
 class Failures:
     """
-    The failures that last, by what fails: an update, a service, the callback of a topic.
+    The lasting failures, by what fails: an update, a service, the callback of a topic.
 
     Any thread may call it.
 
     Parameters
     ----------
     logger : of the node
-    running : returns whether ROS is up: a signal can shut it down under any call, and what that
-        call then raises is no failure
+    running : returns whether ROS is running. A signal can shut it down during any call, and the
+        error of that call is then not a failure
 
     """
 
@@ -45,26 +45,31 @@ class Failures:
         now = time.monotonic()
         return {what: why for what, (why, until) in self._lasting.copy().items() if now < until}
 
+    @property
+    def sentence(self) -> str:
+        """What fails, and why, for the diagnostics; empty if nothing does."""
+        return '; '.join(f'{what} failed: {why}' for what, why in self.lasting.items())
+
     def note(self, what: str, error: Exception, seconds: float = math.inf) -> None:
         """
-        Remember a failure; its traceback is logged the first time that it comes from there.
+        Record a failure; the traceback is logged the first time that it comes from that line.
 
-        seconds : for so long, unless it is over before
+        seconds : how long it is kept, unless it is over before
         """
         if not self._running():
             return
         self._lasting[what] = reason(error), time.monotonic() + seconds
-        # Nothing may be left, memory for one: who reports a failure must not fail by it.
+        # To report a failure must not fail, for example for want of memory.
         with suppress(Exception):
             self._tell(what, error)
 
     def over(self, what: str) -> None:
-        """Forget a failure: it works again."""
+        """Remove a failure: it works again."""
         if self._lasting:
             self._lasting.pop(what, None)
 
     def guarded(self, what: str, callback: Callable[..., None]) -> Callable[..., None]:
-        """Return a callback that notes whatever the given one raises."""
+        """Return a callback that records any error of the given one."""
 
         def guard(*arguments: Any) -> None:
             try:
@@ -89,7 +94,7 @@ class Failures:
 
 
 def reason(error: Exception) -> str:
-    """Return what an error says, with its type where that is not ours, in one line."""
+    """Return the message of an error on one line, with its type if it is not one of ours."""
     text = ' '.join(str(error).split())
     if isinstance(error, L1SlamError | OSError):
         return text or type(error).__name__

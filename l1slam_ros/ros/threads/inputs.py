@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What the node hears: messages of every topic, of each robot -> the back end; see `intake`.
+The inputs of the node: converting the messages of all topics for the back end; see `intake`.
 
-A robot that has a name has its topics below it. Its frames may begin with the name, or not.
+The topics of a robot with a name begin with that name. Its frames may begin with it or not.
 """
 
 import math
@@ -37,31 +37,31 @@ from l1slam_ros.ros.robot import RobotPublisher
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.intake import Intake
 
-# Odometry behind which so much waits is not answered, but for the last: there is no time for it, a
-# publication gives Python up and waits for its turn, and the robot is elsewhere by now.
+# If this many messages wait, poses are published only for the last odometry: each publication
+# releases Python's lock and waits for it again, and the pose is out of date by then.
 _ANSWERED = 5
 _REPEAT_WARNING = 5.0  # [s]
-# So many robots that nobody named are told of by name.
+# Number of unknown robots that the log names.
 _MOST_STRANGERS = 20
 
 
 class Inputs:
     """
-    Appends messages to the back end; what cannot be used is counted.
+    Gives messages to the back end, and counts those that cannot be used.
 
     Parameters
     ----------
     node : to subscribe with
     backend : to append to
     options : of the node
-    failures : where to tell what nobody foresaw
-    robots : answer a sample of their odometry that is used, but not if more wait behind it; their
-        `tick` is called after messages, and again after as many seconds as it returns
+    failures : records unexpected errors
+    robots : publish their pose after a sample of odometry, unless more messages wait; their
+        `tick` is called after messages, and again after the number of seconds that it returns
 
     Attributes
     ----------
-    intake : hands messages over
-    refused : cause -> how many messages could not be used
+    intake : receives the messages
+    refused : cause -> number of messages that could not be used
 
     """
 
@@ -72,7 +72,7 @@ class Inputs:
         self._robots = robots
         self._map_frame, self._odom_frame = options.map_frame, options.odom_frame
         self._unanswered: set[RobotPublisher] = set()
-        # Robots that nobody named, and that was said.
+        # Unknown robots that the log has named.
         self._strangers: set[str] = set()
         self.refused: Counter[str] = Counter()
         self.intake = Intake(node, failures, self._answer, self._tick)
@@ -81,12 +81,12 @@ class Inputs:
 
     @property
     def traffic(self) -> dict[str, Any]:
-        """How the messages of each topic come, by its name."""
+        """The traffic on each topic, by its name."""
         return self.intake.traffic
 
     def _subscribe(self, robot: RobotPublisher) -> None:
         """Subscribe to the topics of a robot."""
-        for name in conversion.LOOPS:
+        for name in conversion.LOOP_TOPICS:
             self.intake.subscribe(PoseWithCovarianceStamped, f'{robot.prefix}{name}',
                                   self._guarded(partial(self._on_loop, robot, name)))
         # Pose graphs of other front ends, where their messages are installed.
@@ -94,16 +94,16 @@ class Inputs:
             use = partial(self._on_pose_graph, front_end.graph(), robot=robot.number)
             for name, msgtype in front_end.topics.items():
                 package, _, kind = msgtype.split('/')
-                # Of an older release of the package, too, that has not all of the messages.
+                # An older release of the package may not have all of the messages.
                 with suppress(ImportError, AttributeError):
                     self.intake.subscribe(getattr(import_module(f'{package}.msg'), kind),
                                           f'{robot.prefix}{name}', use)
-        # Last: not every DDS says when a message came, and a loop may come before its odometry.
+        # Last: some DDS give no times of arrival, and loops may come before their odometry.
         self.intake.subscribe(Odometry, f'{robot.prefix}odom',
                               self._guarded(partial(self._on_odometry, robot)), raw=True)
 
     def _guarded(self, use: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Return what uses messages, and counts those that cannot be."""
+        """Return a callback that uses messages, and counts those that cannot be used."""
         def guard(content: Any) -> None:
             try:
                 use(content)
@@ -129,7 +129,7 @@ class Inputs:
             self._answer()
 
     def _own(self, robot: RobotPublisher, frame: str) -> str:
-        """Return a frame of a robot without the robot's name."""
+        """Return a frame of a robot without the prefix of the robot's name."""
         return frame.removeprefix('/').removeprefix(robot.prefix)
 
     def _answer(self) -> None:
@@ -142,28 +142,22 @@ class Inputs:
         return min((robot.tick() for robot in self._robots), default=math.inf)
 
     def _on_loop(self, robot: RobotPublisher, name: str, message: Any) -> None:
-        base = self._backend.base_frame_of(robot.number).name
-        if not robot.prefix or name not in conversion.LOOPS_BETWEEN:
-            loop = conversion.LOOPS[name](message, base, self._map_frame)
-            self._backend.add_loop(replace(loop, robot=robot.number) if robot.number else loop)
-            return
-        other = self._reference(robot, message.header.frame_id)
-        message.header.frame_id = self._own(other, message.header.frame_id)
-        if other is robot:
-            loop = conversion.LOOPS[name](message, base, self._map_frame)
-        else:
-            loop = conversion.LOOPS_BETWEEN[name](
-                message, self._backend.base_frame_of(other.number).name)
+        other = robot
+        if robot.prefix and name != conversion.ABSOLUTE:
+            other = self._reference(robot, message.header.frame_id)
+            message.header.frame_id = self._own(other, message.header.frame_id)
+        loop = conversion.loop_in(name, message, self._backend.base_frame_of(other.number).name,
+                                  self._map_frame, ordered=other is robot)
         self._backend.add_loop(replace(
             loop, robot=robot.number, reference_robot=other.number))
 
     def _reference(self, robot: RobotPublisher, frame: str) -> RobotPublisher:
         """
-        Return the robot that the reference frame of a loop names, else the one that sent it.
+        Return the robot that the reference frame of a loop names, by default the sender.
 
         Raises
         ------
-        MessageError : `robot`, it names one that the node does not know.
+        MessageError : cause `robot`: it names an unknown robot.
 
         """
         frame = frame.removeprefix('/')
@@ -194,7 +188,7 @@ class Inputs:
                 f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
 
     def _tell_of_stranger(self, sentence: str) -> None:
-        """Say of a robot that nobody named, once, why its loops are refused."""
+        """Log once for each unknown robot why its loops are refused."""
         known = len(self._strangers)
         stranger = sentence.partition('@')[0]
         if stranger in self._strangers or known > _MOST_STRANGERS:

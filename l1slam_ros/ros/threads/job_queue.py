@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Work that services ask for, done one after the other by a thread of its own."""
+"""A queue of the work of services, which a thread of its own carries out in order."""
 
 import queue
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from l1slam_ros.core.errors import Interrupted, L1SlamError
 from l1slam_ros.ros.threads.background import background
 from l1slam_ros.ros.threads.failures import Failures, reason
 
-# [s] A service that failed may not be called again: its failure is told for so long.
+# [s] How long a failure of a service is shown, as it may not be called again.
 _REMEMBERED = 60.0
 
 
@@ -27,13 +27,13 @@ class JobQueue:
     """
     A queue of jobs from service callbacks, carried out in the order they came.
 
-    A callback awaits `put`, so the executor goes on with other callbacks meanwhile. Whatever a
-    job raises, it is answered, and the next one follows.
+    A callback awaits the future of `put`, so the executor goes on with other callbacks. Every job
+    is answered, even if it raises, and then the next one is carried out.
 
     Parameters
     ----------
     node : whose executor runs the callbacks
-    failures : where to tell what nobody foresaw
+    failures : records unexpected errors
     done : called after each job
 
     """
@@ -42,7 +42,7 @@ class JobQueue:
         self._node = node
         self._failures = failures
         self._done = done
-        # What it is called, what is to be done, and where its answer goes; None: the end.
+        # Name, work, and the future of the answer; None ends the thread.
         self._queue: queue.SimpleQueue[tuple[str, Callable[[], str], Future] | None] = (
             queue.SimpleQueue())
         self._thread = background('services', self._work)
@@ -52,7 +52,7 @@ class JobQueue:
         self._thread.start()
 
     def put(self, name: str, work: Callable[[], str]) -> Future:
-        """Queue some work, which returns a sentence; the future's result is the answer."""
+        """Queue work that returns a sentence; return the future of the service's answer."""
         future = Future(executor=self._node.executor)
         self._queue.put((name, work, future))
         return future
@@ -68,7 +68,7 @@ class JobQueue:
             name, work, future = job
             future.set_result(self._carry_out(name, work))
             if (executor := self._node.executor) is not None:
-                executor.wake()  # it looks whether the answer is there only when it is up
+                executor.wake()  # it checks for the answer only when it wakes
 
     def _carry_out(self, name: str, work: Callable[[], str]) -> Trigger.Response:
         try:
@@ -77,7 +77,7 @@ class JobQueue:
         except Interrupted:
             return Trigger.Response(success=False, message='the node is ending')
         except Exception as error:
-            # Of ours the caller is told: the fault lies with the call, not with the node.
+            # Our own errors are faults of the call, not of the node: only the caller gets them.
             if not isinstance(error, L1SlamError | OSError):
                 self._failures.note(name, error, _REMEMBERED)
             return Trigger.Response(success=False, message=reason(error))

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The thread that improves the map, update by update, and survives whatever an update raises."""
+"""The thread that updates the map periodically, and goes on after any error of an update."""
 
 import threading
 import time
@@ -22,9 +22,9 @@ from l1slam_ros.ros.parameters import NodeParameters
 from l1slam_ros.ros.threads.background import background
 from l1slam_ros.ros.threads.failures import Failures
 
-# [s] After a failed update the next one waits; twice as long after each more, up to this.
+# [s] Pause after a failed update; doubled at each further failure, up to the second number.
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 10.0
-# [s] What takes less is not worth a line.
+# [s] Compilation that takes less is not logged.
 _WORTH_TELLING = 1.0
 
 
@@ -35,7 +35,7 @@ class SolverThread:
     Parameters
     ----------
     backend : whose map
-    failures : where to tell what an update raised
+    failures : records the errors of updates
     logger : of the node
     parameters : of the node: how often to update, and how long one update may work
 
@@ -65,16 +65,16 @@ class SolverThread:
         self._thread.start()
 
     def hurry(self) -> None:
-        """Let an update begin now, even if the last one failed just now."""
+        """Begin an update now, even if the last one has just failed."""
         self._not_before = 0.0
         self._woken.set()
 
     def pause(self, paused: bool) -> None:
-        """Let no more updates begin, and one that is at work stop; or go on."""
+        """Pause updates, stopping one that is at work, or resume them."""
         self._paused = paused
 
     def close(self, seconds: float) -> bool:
-        """Tell the thread to end; return whether it did within some seconds."""
+        """End the thread; return whether it ended within `seconds`."""
         self._closing = True
         self._woken.set()
         self._thread.join(seconds)
@@ -96,7 +96,7 @@ class SolverThread:
             # From beginning to beginning: an update is a part of its period.
             due = max(due + self._parameters.options.update.period, time.monotonic())
             self._woken.wait(due - time.monotonic())
-            # In this order, or the call to close is lost.
+            # In this order, or a call of `close` in between is lost.
             self._woken.clear()
             if self._closing:
                 return
@@ -108,12 +108,12 @@ class SolverThread:
             except Interrupted:
                 continue
             except Exception as error:
-                # The last good map stays. What fails always shall not keep a core busy.
+                # The last good map stays. A recurring failure must not keep a core busy.
                 self._failures.note('update', error)
                 self._not_before = time.monotonic() + self._pause
                 self._pause = min(2 * self._pause, _LONGEST_PAUSE)
             else:
-                # What failed behind is tried again, and may fail after the update has returned.
+                # Background work that failed is tried again, and may fail after the update.
                 if improvement is None or not self._backend.behind().failing:
                     self._failures.over('update')
                     self._pause = _FIRST_PAUSE
@@ -145,7 +145,7 @@ class SolverThread:
             else:
                 self._logger.debug('not all is compiled yet: the rest is when it is first called')
         except Exception as error:
-            # Not the end: what is missing is compiled when it is first called.
+            # Not fatal: what is missing is compiled when it is first called.
             self._failures.note('compiling', error)
         self.compiling = ''
         spent = time.monotonic() - began

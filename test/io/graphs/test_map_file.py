@@ -257,9 +257,9 @@ def test_where_no_file_can_be_is_said(tmp_path):
     # A device may be read without end, and is nothing to be replaced by a file.
     robot.options = replace(robot.options, save_path=str(tmp_path / 'map.g2o'))
     (tmp_path / 'map.g2o').symlink_to('/dev/full')
-    assert unusable_path(robot.options.save_path).endswith('which is no regular file')
+    assert unusable_path(robot.options.save_path).endswith('which is not a regular file')
     for call in robot.map_file.save, robot.map_file.autosave, robot.map_file.load:
-        with pytest.raises(FileError, match='map.g2o: cannot be (read|written): it is no regular'):
+        with pytest.raises(FileError, match='map.g2o: cannot be (read|written): it is not a reg'):
             call()
 
 

@@ -9,8 +9,10 @@
 """
 Machine code of compiled loops, kept so that a process runs it without numba.
 
-To import numba and to read a loop by it takes more than to solve a graph. The code that numba
-makes of a loop is one object file; llvmlite, which numba stands on, links it in a millisecond.
+To import numba and read a loop from its cache takes longer than to solve a graph. The code that
+numba makes of a loop is one object file; llvmlite, on which numba is built, links it in a
+millisecond.
 
-`make` has numba compile and keeps what came of it, `objects` is the file, `link` makes functions.
+`make` compiles with numba and takes the result apart, `objects` reads and writes the file, `link`
+makes functions of it.
 """

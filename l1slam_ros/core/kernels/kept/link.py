@@ -9,8 +9,8 @@
 """
 Functions made of kept machine code, by llvmlite alone.
 
-What is done here is what numba does with an object file of its cache, but for the types of a call:
-they are compared here. Any surprise gives no function, and the caller turns to numba.
+This does what numba does with an object file of its cache, and compares the types of a call
+itself. If anything is unexpected there is no function, and the caller uses numba.
 """
 
 import builtins

@@ -7,13 +7,13 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The keeper of a map: it owns the growing graph, the state of its map, and two locks.
+The keeper owns the growing graph, the state of its map, and two locks.
 
-In: messages, and what was made of snapshots. Out: snapshots, and the one number by which all who
-keep something know whether it is stale.
+In: messages, and results computed from snapshots. Out: snapshots, and the revision, a number that
+counts all changes and tells whether a stored result is still up to date.
 
-    _front_lock     the front and its bordered systems, while factors are appended or steps asked
-    _graph_lock     graph, odometry, loops, state and revision: held for moments, so that messages
+    _front_lock     the front and its bordered systems, while factors are added or steps computed
+    _graph_lock     graph, odometry, loops, state and revision: held briefly, so that messages
                     never wait
 
 A thread that needs both takes them in this order; neither is held while solving, or while a file
@@ -45,14 +45,14 @@ from l1slam_ros.core.running.robot_maps import Seen, map_ends
 from l1slam_ros.core.running.snapshot import Robot, SavedMap, Snapshot
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
-# Factors that a front takes while its lock is held, and between two looks at the clock; one where
-# it has so many rows that a loop takes milliseconds.
+# Number of factors that a front takes while its lock is held and before the clock is read; one if
+# the front has so many rows that a loop takes milliseconds.
 _AT_ONCE, _LONG = 4, MOST_ROWS // 2
 
 
 class Revisions(NamedTuple):
     """
-    The number that counts the changes of a back end, and its value at some of them.
+    The revision, which counts the changes of a back end, now and at some earlier changes.
 
     now : the latest; map : when the poses of the map last changed; grown : when the graph last
     grew; graph : when the graph began, which names it
@@ -64,7 +64,7 @@ class Revisions(NamedTuple):
     graph: int = 0
 
     def after(self, map: bool = False, grown: bool = False, graph: bool = False) -> 'Revisions':
-        """Return them after one more change, of these."""
+        """Return the revisions after one more change; changes : which ones it sets."""
         now = self.now + 1
         return Revisions(now, now if map else self.map, now if grown else self.grown,
                          now if graph else self.graph)
@@ -173,7 +173,7 @@ class Keeper:
 
     @contextmanager
     def reading(self) -> Iterator[GraphBuilder]:
-        """Give the builder to be read; nothing changes within the block."""
+        """Yield the builder, locked: it does not change within the block."""
         with self._graph_lock:
             yield self._builder
 
@@ -184,7 +184,7 @@ class Keeper:
 
     @contextmanager
     def standing(self) -> Iterator[Snapshot]:
-        """Give a snapshot; graph, front and state do not change within the block."""
+        """Yield a snapshot; graph, front and state do not change within the block."""
         with self._front_lock:
             front = self._front
             views = front.views if front else ()
@@ -208,7 +208,7 @@ class Keeper:
         return SavedMap(builder, now.optimised(), now.judgement, now.state.robust, graph)
 
     def look(self) -> tuple[MapState, BetweenFactors, Size]:
-        """Return the state, the factors, and how large the graph is."""
+        """Return the state, the factors, and the size of the graph."""
         with self._graph_lock:
             return self._state, self._builder.graph.between, Size.of(self._builder)
 
@@ -250,7 +250,7 @@ class Keeper:
         """
         Make factors of the due loops; let the front take new factors until the deadline [s].
 
-        in_vain : whether it is to take none
+        in_vain : let it take none, see `Updates._in_vain`
         """
         with self._front_lock, self._graph_lock:
             self._add_due_loops()
@@ -272,7 +272,7 @@ class Keeper:
                         self._move(ends)
 
     def _add_due_loops(self) -> None:
-        """Make factors of the loops whose times odometry has reached; the graph is locked."""
+        """Turn loops whose times the odometry has reached into factors; the graph is locked."""
         graph, loops = self._builder.graph, self._builder.loops
         waiting = len(loops.waiting)
         new = self._builder.add_due_loops()

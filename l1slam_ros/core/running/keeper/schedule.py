@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What is due: which map to make, and what to judge.
+Deciding which work is due: making a map, or judging loops.
 
-In: the state of the map, how large the graph is by now, and the moment. Out: pieces of work, one
-for each worker at most. These functions are pure: `updates` has the threads that carry them out.
+In: the state of the map, the size of the graph, and the time. Out: pieces of work, at most one for
+each worker. These functions are pure; `workers` has the threads that carry out the work.
 """
 
 from enum import Enum
@@ -45,7 +45,7 @@ _JUDGEMENTS = (Work.JUDGE, Work.JUDGE_ANEW)
 
 
 class Size(NamedTuple):
-    """How large a graph is: keyframes, rows of its residual, loops among its factors, and all."""
+    """The size of a graph: numbers of keyframes, residual rows, loops, and factors."""
 
     keyframes: int
     rows: int
@@ -54,7 +54,7 @@ class Size(NamedTuple):
 
     @staticmethod
     def of(builder: GraphBuilder) -> 'Size':
-        """Return that of the graph of a builder."""
+        """Return the size of the graph of a builder."""
         graph = builder.graph
         factors = len(graph.between)
         return Size(graph.n_poses, factors * graph.manifold.TANGENT_SIZE,
@@ -63,7 +63,7 @@ class Size(NamedTuple):
 
 class Moment(NamedTuple):
     """
-    Now [s] by any clock.
+    The present time [s], by any clock, and what else the decision depends on.
 
     idle : no message came for a while; budget : [s] of the update; judging : the judge is at work
     """
@@ -75,7 +75,7 @@ class Moment(NamedTuple):
 
 
 def due(state: MapState, size: Size, moment: Moment) -> tuple[Work | None, Work | None]:
-    """Return the work that is due for the mapper and for the judge, each None where nothing is."""
+    """Return the work that is due for the mapper and for the judge; None if there is none."""
     make = is_map_due(state, size, moment.idle)
     judge = _judgement(state, size, moment, make)
     if (moment.judging or judge in _JUDGEMENTS) and is_beyond_fronts(state, size):
@@ -117,7 +117,7 @@ def is_map_due(state: MapState, size: Size, idle: bool) -> bool:
 
 
 def is_late(state: MapState) -> bool:
-    """Return whether the front has taken so many factors that the map is to be factored anew."""
+    """Return whether the front has taken so many factors that a new one is needed."""
     carried = state.carried
     return (carried is None or carried.closed or carried.border > _PART_TAKEN * MOST_ROWS
             or carried.taken >= max(_FEWEST, carried.keyframes // _KEYFRAMES_EACH))
@@ -125,7 +125,7 @@ def is_late(state: MapState) -> bool:
 
 def is_beyond_fronts(state: MapState, size: Size) -> bool:
     """
-    Return whether more has come than the front of a new map would take, as when two robots meet.
+    Return whether more factors came than the front of a new map could take (when robots meet).
 
     Then a map that is begun before the loops are judged is out of date when it is made. It waits
     for one judgement at most.
@@ -134,7 +134,7 @@ def is_beyond_fronts(state: MapState, size: Size) -> bool:
 
 
 def outrun(state: MapState, size: Size) -> bool:
-    """Return whether more has come than the front of a map takes."""
+    """Return whether more factors came than the front of a map can take."""
     carried = state.carried
     return carried is not None and (
         (size.factors - carried.rows) * size.rows > MOST_ROWS * size.factors)

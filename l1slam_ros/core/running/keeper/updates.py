@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Updates of a map: new factors are taken in at once, and workers begin the work that is due.
+Updates of a map: the front takes new factors at once, and workers begin the work that is due.
 
-In: a keeper, and calls of any threads. Out: the account of what an update did. The order of all
-that happens to a message is told in doc/how_a_message_becomes_a_map.md, step by step.
+In: a keeper, and calls from any thread. Out: the result of each update. The page
+doc/how_a_message_becomes_a_map.md lists the steps in order.
 
 One lock admits one thread at a time to update the map or to settle it. Threads that wait for the
 lock are counted, and background work ends early for them. A settle, for which a caller waits, ends
@@ -39,7 +39,7 @@ from l1slam_ros.core.running.keeper.workers import (
 )
 from l1slam_ros.core.running.problem import as_numbered, as_one, by_robot
 
-# [s] The longest time an update takes in new factors, whatever the budget.
+# [s] The longest time for which an update puts factors into the front, whatever the budget.
 _LEAST_TIME = 0.01
 
 
@@ -78,7 +78,7 @@ class Updates:
         """
         See `Backend.update`.
 
-        idle : nothing has come for a while, None: find out; waits : up to `budget` for the workers
+        idle : nothing has come for a while, None: unknown; waits : for the workers, up to `budget`
         """
         start = time.monotonic()
         keeper = self._keeper
@@ -89,7 +89,7 @@ class Updates:
             before = keeper.state
             keeper.take_what_has_come(start + max(budget, _LEAST_TIME), self._in_vain)
             seen = keeper.revisions
-            # What a map begins with is not news.
+            # The content of a map that begins is not new.
             came = seen.grown > max(self._updated, keeper.state.began)
             self._updated = seen.now
             idle = not came if idle is None else idle
@@ -115,8 +115,8 @@ class Updates:
         """
         Return whether the front is to take nothing.
 
-        More has come than it would take, and is being judged, or the map of that is being made:
-        what it took would be gone with it, and take the time of the others.
+        This is so if more factors came than it could take, and they are being judged or mapped:
+        the front would soon be replaced, and its work would delay theirs.
         """
         state, _, size = self._keeper.look()
         return outrun(state, size) and (self._workers.judge.busy or state.pending is not None)
@@ -128,7 +128,7 @@ class Updates:
         return state.account(size.loops, took)
 
     def _begin_due(self, idle: bool, budget: float, check: Check) -> bool:
-        """Start the work that is due; return whether there is any, or was just now."""
+        """Start the work that is due; return whether there is any."""
         # Asked before the state is read: work that ends in between makes other work due.
         busy = self._workers.busy
         moment = Moment(time.monotonic(), idle, budget, self._workers.judge.busy)
@@ -141,7 +141,7 @@ class Updates:
         return busy or make is not None or judge is not None
 
     def _check(self, began: int, stopped: Stopped) -> Check:
-        """Return a check that raises `Interrupted` where work for a map is not wanted any more."""
+        """Return a check that raises `Interrupted` when work for a map is no longer wanted."""
         return until(lambda: bool(self._claims or self._urgent) or stopped()
                      or self._keeper.state.began != began)
 

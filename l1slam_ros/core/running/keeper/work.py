@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What the workers carry out behind updates: each piece of work from a snapshot to its adoption.
+The work that runs behind updates, each piece from its snapshot to the adoption of its result.
 
-In: the keeper of a map. Out: a better map, or a judgement, handed back to it. Nothing is locked
-while it is computed.
+In: the keeper of a map. Out: a better map, or a judgement, given back to the keeper. No lock is
+held while it is computed.
 """
 
 import time
@@ -29,16 +29,16 @@ from l1slam_ros.core.running.keeper.workers import until
 from l1slam_ros.core.running.problem import as_numbered, as_one, by_robot
 from l1slam_ros.core.running.snapshot import Snapshot
 
-# [s] So long a map is improved, whatever the budget; of the clock a round may take some times as
-# long.
+# [s] Time for which a map is improved, whatever the budget; and by what factor a round may take
+# longer by the clock.
 _LEAST_ROUND = 0.1
 _PATIENCE = 4
-# So often a new front takes what came meanwhile, before it is one; so many factors at once.
+# Passes in which a new front takes what came meanwhile, before it is adopted; factors of each.
 _PASSES, _AT_ONCE = 3, 16
 
 
 def carry_out(keeper: Keeper, piece: Work, moment: Moment, check: Check) -> None:
-    """Do a piece of work that was due at a moment; check : raises where it shall stop."""
+    """Do a piece of work that was due at `moment`; check : raises if it is to stop."""
     if piece in (Work.ROUND, Work.EXACT):
         make_map(keeper, piece is Work.EXACT, moment.budget, check)
     elif piece is Work.NORM:
@@ -96,7 +96,7 @@ def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
 
 
 def compare_norms(keeper: Keeper, check: Check) -> None:
-    """Note a doubt where another norm gives a clearly different map."""
+    """Record a doubt if another norm gives a clearly different map."""
     now = keeper.snapshot()
     turned, order = by_robot(now.problem())
     problem = as_one(turned)

@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Threads that only carry out work; their callers decide what to do, and when.
+Threads that carry out work; their callers decide which work, and when.
 
-In: pieces of work, as functions. Out: their end, or what they raised.
+In: pieces of work, as functions. Out: that they have ended, or the error that they raised.
 """
 
 import threading
@@ -22,12 +22,12 @@ from l1slam_ros.core.running.improve import Check
 # [s] How often a waiting thread checks whether to stop.
 LOOK = 0.05
 
-# A check that is called often during work; it raises where the work shall stop.
+# A function that is called often during work and raises if the work is to stop.
 Stopped = Callable[[], bool]
 
 
 def until(over: Stopped, check: Check = lambda: None) -> Check:
-    """Return a check that raises `Interrupted` where another does, or something is over."""
+    """Return a check that calls another check, and raises `Interrupted` when `over()` is true."""
     def checked() -> None:
         check()
         if over():
@@ -49,7 +49,7 @@ def held(lock: threading.Lock, check: Callable[[], None]) -> Iterator[None]:
 
 class Calm:
     """
-    While it lasts, background work pauses in favour of work that a caller waits for.
+    Pauses background work in favour of work that a caller waits for.
 
     There is one interpreter lock, and to get it back from threads that compute may take longer
     than the work. For one thread at a time: `with calm:`.
@@ -76,7 +76,7 @@ class Calm:
 
 
 class Requests:
-    """How many threads ask for something at the moment; true while any does."""
+    """Counts the threads that ask for something; true while any does."""
 
     def __init__(self) -> None:
         self._count = 0

@@ -7,11 +7,11 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The messages before the first damage of a bag that the bag library refuses.
+Reading the messages before the first damage of a bag that the bag library refuses.
 
 The files of a bag are walked in the order in which they were written, up to the first damage.
-What lies behind is not used: odometry that ends early gives a smaller map, odometry with a piece
-missing in its middle a wrong one.
+Messages behind it are not used: odometry that ends early gives a smaller map, odometry with a gap
+a wrong one.
 """
 
 import re
@@ -33,21 +33,21 @@ from l1slam_ros.io.bags.damaged.walk_sqlite import walk_sqlite
 from l1slam_ros.io.bounded import read_yaml
 
 METADATA = 'metadata.yaml'
-# How rosbag2 names the files of a bag; `.zstd` where it compresses them as a whole.
+# How rosbag2 names the files of a bag; `.zstd` if whole files are compressed.
 _STORAGE_NAME = re.compile(r'(?P<bag>.+?)(_[0-9]+)?(\.mcap|\.db3)(\.zstd)?')
-# The first bytes of a message that rosbag2 has compressed by itself; of CDR they never are.
+# The first bytes of a message that rosbag2 compressed alone; CDR never begins like this.
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 _WALKS = {'.mcap': walk_mcap, '.db3': walk_sqlite}
 _PIECE = 4096  # [bytes] of a compressed file that are decompressed at a time
-_MOST_PACKED = 200  # a compressed file is at most so many times larger: images of one colour are
-_COMPLAINT = 200  # the longest piece of a library's complaint that is passed on
+_MOST_PACKED = 200  # largest ratio of compression: images of a single colour come near it
+_COMPLAINT = 200  # largest number of characters of a library's error that are quoted
 
 
 class DamageError(Exception):
     """
-    What keeps a bag from being read to its end.
+    Why a bag cannot be read to its end.
 
-    where : words that follow 'damaged'; used : which messages are
+    where : the words after 'damaged'; used : which messages are used
     """
 
     def __init__(self, path: Path, where: str, used: str = 'before that'):
@@ -61,7 +61,7 @@ class DamageError(Exception):
 
 class Salvage:
     """
-    A damaged bag, looked through once when this is made.
+    A damaged bag; the constructor reads through it once.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Salvage:
     ----------
     counts : (topic, type) -> how many messages were found
     times : when they were recorded, in the order in which they were written [ns]
-    damage : what ended the search; None: it came to the end
+    damage : what ended the reading; None: it came to the end
 
     """
 
@@ -91,15 +91,15 @@ class Salvage:
     def messages(self, topics: Collection[str] | None, start: int | None,
                  stop: int | None) -> Iterator[BagMessage]:
         """
-        Yield the messages in order of time, those of one time in the order of the files.
+        Yield the messages in order of time; equal times in the order of the files.
 
-        The bag is walked once more, so that only messages ahead of their time are in memory.
+        The bag is read once more, so that only messages that are ahead of time are held in memory.
 
         topics : only these; None: all; start, stop : only from start [ns] on and before stop [ns]
         """
         order = deque(sorted(range(len(self.times)), key=self.times.__getitem__))
         waiting: dict[int, BagMessage] = {}
-        # So many: it ends before the walk comes to the damage.
+        # As many as were counted, so this ends before the damage.
         for k, message in enumerate(islice(self._walk(), len(order))):
             waiting[k] = message
             while order and order[0] in waiting:
@@ -110,7 +110,7 @@ class Salvage:
                     yield due
 
     def types(self) -> Any:
-        """Return the types to decode by: of Jazzy; what it has not, as the bag defines it."""
+        """Return the types for decoding: those of Jazzy, and others as the bag defines them."""
         types = get_typestore(Stores.ROS2_JAZZY)
         for name, text in self._definitions.items():
             with suppress(Exception):  # a damaged definition makes the library raise anything
@@ -147,20 +147,20 @@ class Salvage:
 
 
 def complaint(error: Exception) -> str:
-    """Return what a library complains of, on one line."""
+    """Return the message of a library's error on one line."""
     return ' '.join(str(error).split())[:_COMPLAINT] or type(error).__name__
 
 
 def directory_metadata(bag: Path) -> dict[str, Any]:
-    """Return what the metadata.yaml of a bag says, nothing where it cannot be read."""
-    with suppress(Exception):  # it may be missing, no text, no YAML or other YAML
+    """Return the content of the metadata.yaml of a bag; empty if it cannot be read."""
+    with suppress(Exception):  # it may be missing, or not text, or not such YAML
         document = read_yaml((bag / METADATA).read_text(encoding='utf-8'))
         return dict(document['rosbag2_bagfile_information'])
     return {}
 
 
 def storage_files(directory: Path) -> list[Path]:
-    """Return the files of a bag that are there, in the order of their numbers."""
+    """Return the existing files of a bag in the order of their numbers."""
     def by_number(path: Path) -> list[tuple[str, int]]:
         return [(text, int(number or 0)) for text, number
                 in re.findall(r'(\D*)([0-9]*)', path.name)]
@@ -170,18 +170,18 @@ def storage_files(directory: Path) -> list[Path]:
 
 
 def bag_names(directory: Path) -> set[str]:
-    """Return the names of the bags that a directory has files of, without their numbers."""
+    """Return the names, without numbers, of the bags whose files are in a directory."""
     matches = map(_STORAGE_NAME.fullmatch, (path.name for path in directory.iterdir()))
     return {match['bag'] for match in matches if match}
 
 
 def _files(bag: Path) -> tuple[list[Path], DamageError | None]:
-    """Return the files of a bag in the order of writing, and what is wrong with their list."""
+    """Return the files of a bag in the order of writing, and an error if their list is damaged."""
     if not bag.is_dir():
         return [bag], None
     names = directory_metadata(bag).get('relative_file_paths')
     if isinstance(names, list) and names and all(isinstance(name, str) for name in names):
-        # Older versions name the directory too.
+        # Older versions include the directory.
         return [bag / Path(name).name for name in names], None
     wrong = 'cannot be read' if (bag / METADATA).exists() else 'is missing'
     return storage_files(bag), DamageError(bag, f': its {METADATA} {wrong}', 'of its files')
@@ -189,7 +189,7 @@ def _files(bag: Path) -> tuple[list[Path], DamageError | None]:
 
 @contextmanager
 def _decompressed(file: Path) -> Iterator[Path]:
-    """Yield the name of a file that can be read: itself, or what is in it, as far as it goes."""
+    """Yield a readable file: this one, or its decompressed content as far as it goes."""
     if file.suffix != '.zstd':
         yield file
         return
@@ -208,7 +208,7 @@ def _decompressed(file: Path) -> Iterator[Path]:
 
 
 def _unpacked(message: BagMessage) -> BagMessage:
-    """Return a message, decompressed where it was compressed by itself."""
+    """Return a message, decompressed if it was compressed alone."""
     if not message.data.startswith(_ZSTD_MAGIC):
         return message
     return message._replace(data=unpacked('zstd', message.data))

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What the walks through bag files share: each yields messages from the start to the damage."""
+"""Types shared by the readers of damaged files, which yield messages up to the damage."""
 
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ class BagMessage(NamedTuple):
 
 
 class BrokenRecordError(Exception):
-    """The walk ends; `position` [bytes] is where in the file, or in the chunk."""
+    """Reading ends at `position` [bytes] in the file, or in the chunk."""
 
     def __init__(self, position: int):
         super().__init__(f'no readable record at byte {position}')

@@ -7,11 +7,11 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-An MCAP file record by record from its start, as far as it can be read; no index is needed.
+Reading an MCAP file record by record from its start, as far as possible, without an index.
 
-A file is a row of records: opcode, length, content. A chunk's content is such a row again,
-usually compressed. Of a chunk that the end of the file cuts, or that is damaged inside, what
-comes before is decompressed and used.
+A file is a sequence of records: opcode, length, content. A chunk contains such a sequence, usually
+compressed. If a chunk is cut by the end of the file or damaged inside, the part before that is
+decompressed and used.
 """
 
 import struct
@@ -35,7 +35,7 @@ _MESSAGE = 5
 _CHUNK = 6
 _METADATA = 12
 _DATA_END = 15
-# Opcodes between are kept for later versions of the format; zeros are what a power cut leaves.
+# Opcodes between are reserved for later versions of the format; a power cut leaves zeros.
 _LAST_OPCODE, _FIRST_FOREIGN_OPCODE = 15, 128
 _HEAD = struct.Struct('<BQ')
 _MESSAGE_HEAD = struct.Struct('<HIQQ')
@@ -50,7 +50,7 @@ def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
     Parameters
     ----------
     path : an MCAP file
-    definitions : message type -> its `ros2msg` definition; those of the file are put in
+    definitions : message type -> its `ros2msg` definition; those of the file are added
 
     Raises
     ------
@@ -69,7 +69,7 @@ def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
                 continue
             require_small(length, 'a record')
             content = file.read(length)
-            # The last record of a whole file is none of these: this one is cut.
+            # The last record of a complete file is of another kind, so this one is cut.
             position = size if file.tell() == size else start
             read = channels.chunk if opcode == _CHUNK else partial(channels.record, opcode)
             try:
@@ -84,7 +84,7 @@ def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
 
 
 def mcap_metadata(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the name and the entries of each metadata record of a file, up to its first damage."""
+    """Yield name and entries of each metadata record of a file, up to the first damage."""
     with path.open('rb') as file:
         file.seek(len(MAGIC))
         for _, opcode, length in _records(file, path.stat().st_size):
@@ -94,7 +94,7 @@ def mcap_metadata(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def is_indexed(path: Path) -> bool:
-    """Tell whether a file has an index that is unharmed and leads to all its messages."""
+    """Tell whether a file has an undamaged index of all its messages."""
     with path.open('rb') as file:
         summary = make_reader(file).get_summary()
         if summary is None or summary.statistics is None:
@@ -113,7 +113,7 @@ def is_indexed(path: Path) -> bool:
 
 
 def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
-    """Yield start, opcode and length of each record, the stream at its content."""
+    """Yield start, opcode and length of each record; the stream is then at its content."""
     start = stream.tell()
     while start < size:
         stream.seek(start)
@@ -132,12 +132,12 @@ def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
 
 
 def _parsed(kind: str, content: bytes) -> Any:
-    """Return a record as the mcap library has it, by the name of its kind there."""
+    """Parse a record with the mcap library; kind : its class there."""
     return getattr(records, kind).read(data_stream.ReadDataStream(BytesIO(content)))
 
 
 class _Channels:
-    """Turns records into messages, by the channels announced before them."""
+    """Turns records into messages, by the schemas and channels before them."""
 
     def __init__(self, definitions: dict[str, str]):
         self._definitions = definitions
@@ -146,7 +146,7 @@ class _Channels:
         self._topics: dict[int, tuple[str, str] | None] = {}
 
     def record(self, opcode: int, content: bytes) -> Iterator[BagMessage]:
-        """Yield the message that a record is; of any other, learn what it says."""
+        """Yield the message in a record; remember the content of schemas and channels."""
         if opcode == _MESSAGE:
             channel_id, _, time, _ = _MESSAGE_HEAD.unpack_from(content)
             topic = self._topics[channel_id]
@@ -163,7 +163,7 @@ class _Channels:
                                         if channel.message_encoding == 'cdr' else None)
 
     def chunk(self, content: bytes) -> Iterator[BagMessage]:
-        """Yield the messages of a chunk, in part where it is damaged."""
+        """Yield the messages of a chunk; those before the damage if it is damaged."""
         chunk = _parsed('Chunk', content)
         rows = chunk.data
         require_small(chunk.uncompressed_size, 'a chunk')

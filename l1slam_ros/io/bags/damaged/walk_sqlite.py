@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""A .db3 file of rosbag2, row by row in the order of writing, as far as it can be read."""
+"""Reading a .db3 file of rosbag2 row by row in the order of writing, as far as possible."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ Row = tuple[int, int, bytes]
 
 
 def walk_sqlite(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
-    """Yield the messages of a .db3 in the order of writing; put its definitions in."""
+    """Yield the messages of a .db3 in the order of writing; fill in its `definitions`."""
     with opened(path) as database:
         require_tables(database)
         with suppress(sqlite3.Error):  # older versions have no definitions
@@ -36,7 +36,7 @@ def walk_sqlite(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]
         topics = {key: (name, msgtype) for key, name, msgtype in database.execute(
             "SELECT id, name, type FROM topics WHERE serialization_format = 'cdr'")}
         cut = is_cut(path)
-        # Of a page that is lost in part SQLite would take the lost part for zeros.
+        # SQLite would read the lost part of a page as zeros.
         rows = leaf_rows(path) if cut else database.execute(
             'SELECT topic_id, CAST(timestamp AS INTEGER), CAST(data AS BLOB) FROM messages '
             'ORDER BY id')
@@ -61,7 +61,7 @@ def _page_size(header: bytes) -> int:
 
 def leaf_rows(path: Path) -> Iterator[Row]:
     """
-    Yield the messages of a database that is cut, page by page, up to the first that is not whole.
+    Yield the messages of a database that is cut, up to the first incomplete page.
 
     SQLite finds the leaves of a table from its root down. A table that outgrows a level gets its
     new inner pages at the end of the file, and without these a file that is cut has no way to
@@ -78,7 +78,7 @@ def leaf_rows(path: Path) -> Iterator[Row]:
                 file.seek((number - 1) * size)
                 if file.read(1) == _TABLE_LEAF:
                     leaves.append(number)
-            # Without a journal, of so many pages.
+            # A header without a journal, and with this number of pages.
             file.seek(0)
             file.write(header[:18] + b'\1\1' + header[20:28] + pages.to_bytes(4, 'big'))
             file.truncate(pages * size)
@@ -90,13 +90,13 @@ def leaf_rows(path: Path) -> Iterator[Row]:
                 database.execute("UPDATE sqlite_master SET rootpage = ? WHERE name = 'messages'",
                                  (number,))
                 database.execute('PRAGMA writable_schema = RESET')
-                # Rows of other tables have no blob there.
+                # Rows of other tables have no blob in this column.
                 yield from database.execute(
                     "SELECT topic_id, timestamp, data FROM messages WHERE typeof(data) = 'blob'")
 
 
 def has_journal(path: Path) -> bool:
-    """Tell whether a part of a database is still beside it, as where its recorder was killed."""
+    """Tell whether a database has a journal, as when its recorder was killed."""
     return _journal(path).exists()
 
 
@@ -106,7 +106,7 @@ def _journal(path: Path) -> Path:
 
 @contextmanager
 def opened(path: Path) -> Iterator[sqlite3.Connection]:
-    """Yield a database; one with a journal is put together in a copy."""
+    """Open a database; with a journal, a copy in which both are joined."""
     with TemporaryDirectory() as folder:
         options = 'immutable=1'
         if has_journal(path):
@@ -115,13 +115,13 @@ def opened(path: Path) -> Iterator[sqlite3.Connection]:
             path = Path(copyfile(path, Path(folder, path.name)))
         address = f'{path.resolve().as_uri()}?{options}'
         with closing(sqlite3.connect(address, uri=True)) as database:
-            # Else SQLite refuses all of a file that is shorter than its first page says.
+            # Without this SQLite refuses a file that is shorter than its first page says.
             database.execute('PRAGMA writable_schema = ON')
             yield database
 
 
 def sqlite_metadata(path: Path) -> str:
-    """Return the copy of metadata.yaml in a .db3, empty where there is none."""
+    """Return the copy of metadata.yaml in a .db3, empty if there is none."""
     with opened(path) as database:
         require_tables(database)
         for (text,) in database.execute('SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1'):
