@@ -47,7 +47,8 @@ _NO_COLUMNS = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32
 _LONG = 8000
 # Multiplications of numbers, some 50 ms, from which separators may pay for the loops that find
 # them: those are compiled at their first use on a machine, for 5 s.
-VAST = 1.5e8
+# Where keyframes have more neighbours in the mean, they spare next to nothing.
+VAST, _CROWDED = 1.5e8, 20
 # A graph that has grown by more is ordered anew, which is seldom enough to cost nothing. Had it
 # never been, City's last factorisation, six thousand keyframes on, would do a quarter more work.
 GROWN = 1.1
@@ -117,8 +118,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
 
     Parameters
     ----------
-    keyframe, size : as in `LinearSystem`
-    k : size of a block
+    keyframe, size : as in `LinearSystem`; k : size of a block
     before : of fewer keyframes and factors. Until they are a tenth more, its order stays but for
         keyframes that new factors join and those above them in the elimination tree: finding that
         takes a fifth of the time, and it fills in little more
@@ -136,7 +136,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
         if pattern is not None and pattern.blocks <= most_blocks:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
-    vast = max(VAST, _SEARCH * size * _RATE / uses)
+    vast = max(VAST, _SEARCH * size * _RATE / uses) if len(graph[1]) < _CROWDED * size else np.inf
     for dissect, least in (kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, vast):
         if pattern is None or pattern.work * k**3 > max(_LONG * size, least):
             dissected = _laid_out(graph, most_blocks, dissect(*graph), _NO_COLUMNS, size)
