@@ -48,6 +48,8 @@ _LONG = 8000
 # Multiplications, some 50 ms, from which separators are tried. The loops that find them are
 # compiled at their first use on a machine, which takes 5 s.
 VAST = 1.5e8
+# If keyframes have more neighbours than this in the mean, separators save next to nothing.
+_CROWDED = 20
 # A graph that has grown by more than this fraction is ordered anew, which is rare. Without that,
 # City's last factorisation, six thousand keyframes later, would do a quarter more work.
 GROWN = 1.1
@@ -117,8 +119,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
 
     Parameters
     ----------
-    keyframe, size : as in `LinearSystem`
-    k : size of a block
+    keyframe, size : as in `LinearSystem`; k : size of a block
     before : of fewer keyframes and factors. Until they are a tenth more, its order stays but for
         keyframes that new factors join and those above them in the elimination tree: finding that
         takes a fifth of the time, and it fills in little more
@@ -136,7 +137,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
         if pattern is not None and pattern.blocks <= most_blocks:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
-    vast = max(VAST, _SEARCH * size * _RATE / uses)
+    vast = max(VAST, _SEARCH * size * _RATE / uses) if len(graph[1]) < _CROWDED * size else np.inf
     for dissect, least in (kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, vast):
         if pattern is None or pattern.work * k**3 > max(_LONG * size, least):
             dissected = _laid_out(graph, most_blocks, dissect(*graph), _NO_COLUMNS, size)
