@@ -91,7 +91,7 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
             weighted = J.T @ prior_information
             A = A + weighted @ J
             b = b + weighted @ expected
-        step = -np.linalg.solve(A + _LEAST, b)
+        step: Array = -np.linalg.solve(A + _LEAST, b).astype(float)
         pose = se2.retract(pose[None], step[None])[0]
         narrow = gate <= _NARROWEST
         gate = max(gate * _SHRINK, _NARROWEST)
