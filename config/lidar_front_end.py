@@ -60,19 +60,19 @@ class LidarFrontEnd(Node):
         self.map, self.maps, self.began, self.way = VoxelMap(CELL, RANGE), [], None, 0.0
         self.odometry = self.create_publisher(Odometry, 'odom', 100)
         self.loops = self.create_publisher(PoseWithCovarianceStamped, 'loop_closures', 100)
-        self.create_subscription(PointCloud2, 'points', self.on_points, 100)
+        self.create_subscription(PointCloud2, 'points', self._on_points, 100)
 
-    def on_points(self, cloud):
+    def _on_points(self, cloud):
         points, _ = self.kiss.register_frame(*points_in(cloud))
         now, stamp = self.kiss.last_pose, cloud.header.stamp
         self.odometry.publish(said(Odometry(child_frame_id='base_link'), 'odom', stamp, now))
         self.way += np.linalg.norm(self.kiss.last_delta[:3, 3])
         if self.began is None or self.way > WAY:
-            self.look_back()
+            self._look_back()
             self.began, self.way = (stamp, now), 0.0
         self.map.integrate_frame(points, np.linalg.inv(self.began[1]) @ now)
 
-    def look_back(self):
+    def _look_back(self):
         """End a map, which lies in the frame of its first cloud; find the earlier ones in it."""
         if self.began is None:
             return
