@@ -55,6 +55,20 @@ def test_a_corridor_says_nothing_along_itself(rng):
     assert held.curvature > 5 * found.curvature
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_what_noisy_normals_say_along_a_corridor_is_nothing(seed):
+    """A metre on, with 2 cm of noise, so that normals are off by some hundredths of a radian."""
+    rng = np.random.default_rng(seed)
+    field = Field.of(*surface(np.zeros(3), rng, CORRIDOR, 0.02, 8.0))
+    wheels = np.array([1.0, 0.05, 0.02])
+    W = np.diag(np.full(3, 0.4**-2))
+    seen = surface(np.array([1.2, 0.0, 0.0]), rng, CORRIDOR, 0.02, 8.0)
+    found = match(field, *seen, wheels, wheels, W)
+    sigma = np.sqrt(np.diag(np.linalg.inv(found.information + W)))
+    assert found.pose == pytest.approx((1.0, 0.0, 0.0), abs=0.02)
+    assert sigma[0] == pytest.approx(0.4, abs=0.02) and (sigma[1:] < 0.05).all()
+
+
 def test_along_a_corridor_the_wheels_are_believed(rng):
     field = Field.of(*surface(np.zeros(3), rng, CORRIDOR, farthest=8.0))
     wheels = np.array([0.3, 0.05, 0.02])

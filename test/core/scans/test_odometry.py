@@ -154,6 +154,27 @@ def test_a_metre_backwards_that_the_wheels_count_as_forwards():
     assert {keyframe.part for keyframe in odometry.keyframes} == {0}
 
 
+@pytest.mark.parametrize('seed', [2, 3])
+def test_among_thin_things_it_backs_up_and_the_wheels_say_forwards(seed):
+    """Of 40 legs 6 cm thick one scan sees others than the next, and little of its map."""
+    low = np.random.default_rng(seed).uniform((0.5, 0.5), (13.5, 5.5), (40, 2))
+    walls = np.concatenate((ROOMS, *(box(x, y, x + 0.06, y + 0.06) for x, y in low)))
+    way = along(THROUGH, 1.0)
+    back = se2.compose(np.tile(way[9], (2, 1)), np.array([(-0.6, 0, 0.4), (-0.6, 0, 0.9)]))
+    way = np.concatenate((way[:10], back, way[10:]))
+    scans, _ = drive(way, seed, walls, ahead)
+    steps = se2.between(way[:-1], way[1:])
+    steps[steps[:, 0] < 0, 0] *= -1
+    wheels = [np.zeros(3)]
+    for step in steps:
+        wheels.append(se2.compose(wheels[-1][None], step[None])[0])
+    odometry = ScanOdometry()
+    found = np.array([odometry.add(scan.stamp, points_of(scan), pose).pose
+                      for scan, pose in zip(scans, wheels, strict=True)])
+    true = se2.between(np.broadcast_to(way[0], way.shape), way)
+    assert np.hypot(*(found - true)[:, :2].T).max() < 0.15
+
+
 def test_a_laser_a_little_aside_is_no_reason_to_doubt_the_wheels():
     """It sits 9 cm ahead of where it is said to be, and the robot turns on the spot."""
     true = np.column_stack((np.full((12, 2), (4.0, 1.5)), 0.5 * np.arange(12)))
