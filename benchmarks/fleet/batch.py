@@ -89,10 +89,12 @@ def whole(folder: Path, output: Path, workers: int) -> float:
 def killed(folder: Path, output: Path, kills: int, seconds: float) -> None:
     """Kill the command so many times while it runs, and each time a worker before; resume."""
     for number in range(kills + 1):
+        before = len(lines(output))
         process = start(folder, output, '--workers', '2', *(['--resume'] if number else []))
         if number < kills:
             time.sleep(seconds / (kills + 1) / 2)
-            for line in lines(output)[-1:]:
+            # Workers that an earlier command had may be gone, and their numbers others'.
+            for line in lines(output)[before:][-1:]:
                 os.kill(int(line['worker'].rpartition(':')[2]), signal.SIGKILL)
             time.sleep(seconds / (kills + 1) / 2)
             process.kill()
