@@ -238,7 +238,6 @@ class ChangingOrder:
         return cls(rows, cholesky_of(graph, None, _FEW).pattern, len(rows))
 
 
-
 def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
            report: Report = lambda iteration, cost: None) -> Array:
     """Return the L2 map of a graph to within its noise, (n, p); see `l2_optimum`."""
