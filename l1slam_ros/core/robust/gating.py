@@ -28,11 +28,6 @@ Gate = Callable[[Indices], Array]
 
 # Of factors that are believed at one time, any is false with at most this probability.
 DOUBT = 0.01
-# Of places that are believed at one time, by the surest factor of each, this part is false at
-# most; and so many of factors that are false for sure are as likely as one of these.
-FALSE_PLACES = 1e-3
-# A round that takes in this part of what fits is worth its price.
-_WORTH = 0.25
 # The noise is judged by so many of the best predicted factors.
 _BEST_PREDICTED = 1000
 _ROUNDS = 100
@@ -78,7 +73,7 @@ def probability(log_odds: Array) -> Array:
 
 def believable(
     found: Innovations, posterior: Posterior, gate: Gate, fits: Mask, believed: int,
-    place: Indices, beside: Array, by_chance: Callable[[], float],
+    place: Indices, beside: Array,
 ) -> Indices:
     """
     Return the factors that may be believed: each by itself, or else together, (k,).
@@ -88,48 +83,23 @@ def believable(
     gate : what squares of true factors stay below, by their freedom; fits : (m,) which do
     believed : how many others are true for sure
     place : (m,) see `places`; beside : (m,) what these say, see `beside_refused`
-    by_chance : returns the log ratio that all but `FALSE_PLACES` of false ones stay below
 
     """
     log_ratio = found.log_ratio()
     odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), believed)
     log_odds = np.logaddexp(
         odds + beside, rivals(found, posterior, (fits, log_ratio, odds), place))
-    fit = np.flatnonzero(fits)
-    good: Indices = fit[at_once((log_ratio - log_odds)[fits], place[fits],
-                                lambda some: log_ratio[fit[some]] > by_chance())]
+    good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits])]
     if not len(good):
         good = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
     return good
 
 
-def at_once(log_odds: Array, place: Indices, may_be: Callable[[Indices], Mask]) -> Indices:
-    """
-    Return which may be believed, all of them at once, surest first.
-
-    As many as are all true but for `DOUBT`. Where these are few, also of each further place the
-    surest one, as long as no more than `FALSE_PLACES` of the places are expected to be false (the
-    false discovery rate of Y. Benjamini and Y. Hochberg, 1995). Lies of one place fit all if one
-    does: so a place has one, and the map that knows it judges the others.
-
-    Parameters
-    ----------
-    log_odds : (m,) ln (true / false)
-    place : (m,) see `places`
-    may_be : asked which of some, (k,), are not likely by chance as well, (k,) bool
-
-    """
+def at_once(log_odds: Array) -> Indices:
+    """Return which may be believed, all of them at once, by ln (true / false), surest first."""
     doubt = probability(-log_odds)
     order = np.argsort(doubt, kind='stable')
-    doubt = doubt[order]
-    sure = np.cumsum(doubt) < DOUBT
-    if np.count_nonzero(sure) < _WORTH * len(sure):
-        surest = np.zeros(len(order), bool)
-        surest[np.unique(place[order], return_index=True)[1]] = True
-        few = np.cumsum(doubt * surest) < FALSE_PLACES * np.cumsum(surest)
-        further = np.flatnonzero(surest & few & ~sure)
-        sure[further] = may_be(order[further])
-    good: Indices = order[sure]
+    good: Indices = order[np.cumsum(doubt[order]) < DOUBT]
     return good
 
 
@@ -154,9 +124,8 @@ def together(found: Innovations, posterior: Posterior, gate: Gate,
     agree = square < gate(found.freedom[one] + found.freedom[other])
     gain = both - log_ratio[one] - np.maximum(odds[other], 0.0)
     np.maximum.at(far, one[agree], gain[agree])
-    vouched = np.flatnonzero(far > 0)
-    believed: Indices = vouched[at_once((log_ratio + far - odds)[vouched], place[vouched],
-                                        lambda some: np.zeros(len(some), bool))]
+    believed: Indices = np.flatnonzero(
+        (log_ratio + far > odds + np.log(1 / DOUBT - 1)) & (far > 0))
     return believed
 
 
