@@ -194,7 +194,7 @@ def test_replay_is_paced(backend, bag):
 
 @pytest.mark.parametrize('arguments, complaint', [
     (('/no/such/bag',), 'no such file'),
-    ((__file__,), 'no bag'),
+    ((__file__,), 'does not have the name of a bag'),
 ])
 def test_replay_of_no_bag_is_one_line_and_exit_code_2(arguments, complaint):
     played = replay(*arguments)

@@ -230,7 +230,9 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
                      *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
     confidence = forecast(terms) if loops.any() else float('nan')
     left_out = np.flatnonzero(loops & ~accepted)
-    if settled and np.count_nonzero(loops) >= HANDFUL and forecast(terms[:3]) < CONFIDENT:
+    # Where all loops came in, what the file states may be vague; there is nothing to settle.
+    if (settled and len(left_out) and np.count_nonzero(loops) >= HANDFUL
+            and forecast(terms[:3]) < CONFIDENT):
         metres = unsure * right_within(growth.given.graph.manifold.positions(growth.poses))
         reasons += (doubt_of(given.factors.pairs[left_out], growth.given.graph.n_poses, WEAK,
                              f'{metres:.2g}'),)

@@ -9,9 +9,8 @@
 """
 Sparse Cholesky factorisation of J'WJ in blocks of a keyframe's size, used by all solvers.
 
-In: the keyframes of each factor. Out: solutions of normal equations. The order of elimination
-and the pattern of the factor are those of keyframes, found once (`Pattern`) and used for blocks of
-every size: of the rotations alone, of the translations, of whole poses.
+In: the keyframes of each factor. Out: solutions of normal equations. The elimination order and
+the pattern are found once (`Pattern`), for blocks of rotations, of translations, of whole poses.
 """
 
 import os
@@ -42,8 +41,7 @@ Columns = tuple[Places, Indices, Places]
 _NONE = np.zeros(0, np.int64)
 _NO_COLUMNS = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32)
 
-# Multiplications per keyframe from which a factorisation is long: then a better order saves more
-# time than it takes to find.
+# Multiplications per keyframe from which a better order saves more time than it takes to find.
 _LONG = 8000
 # Multiplications, some 50 ms, from which separators are tried. The loops that find them are
 # compiled at their first use on a machine, which takes 5 s.
@@ -112,17 +110,16 @@ class Pattern:
 def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
                  before: Pattern | None = None, uses: int = _FACTORISATIONS) -> Pattern:
     """
-    Return an elimination order with little fill, and the pattern of its factor.
+    Return the best elimination order that is found, and the pattern of its factor.
 
-    The best of: minimum degree; for a long factorisation, level-set dissection; and for one that
-    is still very long, dissection by separators.
+    By minimum degree; also by levels if a factorisation is long, by separators if it is vast.
 
     Parameters
     ----------
     keyframe, size : as in `LinearSystem`; k : size of a block
-    before : of fewer keyframes and factors. Until they are a tenth more, its order stays but for
-        keyframes that new factors join and those above them in the elimination tree: finding that
-        takes a fifth of the time, and it fills in little more
+    before : of fewer keyframes and factors. Up to `GROWN` times as many, only keyframes that new
+        factors join and those above them in the elimination tree are ordered anew: that takes a
+        fifth of the time, and fills in little more
     uses : factorisations to come; for few, separators are not worth the time
 
     Raises

@@ -53,14 +53,7 @@ from l1slam_ros.io.graphs.rows import (
     without_circles,
 )
 from l1slam_ros.io.graphs.side_files import named_loops, read_stamps, write_beside
-from l1slam_ros.io.graphs.tags import (
-    FACTORS,
-    NO_OFFSET,
-    OFFSET,
-    SENSORS,
-    TAGS,
-    TAGS_LEFT_OUT,
-)
+from l1slam_ros.io.graphs.tags import FACTORS, NO_OFFSET, OFFSET, SENSORS, TAGS, TAGS_LEFT_OUT
 from l1slam_ros.io.ours import MARK
 from l1slam_ros.io.remarks import Remarks
 
