@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""A front end for a lidar in space, of kiss-icp and map_closures: copy it, and fit its numbers."""
+"""A front end for a 3D lidar, of kiss-icp and map_closures: copy it, and adapt its numbers."""
 
 import numpy as np
 import rclpy
@@ -22,8 +22,11 @@ from rclpy.node import Node
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2
 
-RANGE, CELL, WAY = 60.0, 0.5, 40.0  # [m] of the lidar, of a cell of a map, that a map is long
-INLIERS, SIGMAS = 5, (0.1, 0.01)  # more make a loop; how certain one is [m], [rad]
+RANGE = 60.0  # [m] of the lidar
+CELL = 0.5  # [m] of a local map
+WAY = 40.0  # [m] driven in a local map
+INLIERS = 5  # more of them make a loop
+SIGMAS = 0.1, 0.01  # [m], [rad] of a loop
 KINDS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 
 
@@ -40,8 +43,8 @@ def points_in(cloud):
     return xyz[seen], table[times[0]][seen].astype(float) if times else np.zeros(0)
 
 
-def said(message, frame, stamp, pose):
-    """Return a message of a pose (4, 4)."""
+def filled(message, frame, stamp, pose):
+    """Return the message with its header, and with a pose (4, 4)."""
     message.header.frame_id, message.header.stamp = frame, stamp
     p, q = message.pose.pose.position, message.pose.pose.orientation
     p.x, p.y, p.z = pose[:3, 3].tolist()
@@ -50,14 +53,19 @@ def said(message, frame, stamp, pose):
 
 
 class LidarFrontEnd(Node):
-    """Tells the back end how the lidar moved, and of places that it knows again."""
+    """Publishes how the lidar moved, and a loop for each place that is recognised."""
 
     def __init__(self):
         super().__init__('lidar_front_end')
         self.config = load_config(None)
-        self.config.data.max_range, self.config.mapping.voxel_size = RANGE, 2 * CELL
-        self.kiss, self.places = KissICP(self.config), MapClosures()
-        self.map, self.maps, self.began, self.way = VoxelMap(CELL, RANGE), [], None, 0.0
+        self.config.data.max_range = RANGE
+        self.config.mapping.voxel_size = 2 * CELL
+        self.kiss = KissICP(self.config)
+        self.places = MapClosures()
+        self.map = VoxelMap(CELL, RANGE)
+        self.maps = []
+        self.began = None
+        self.way = 0.0
         self.odometry = self.create_publisher(Odometry, 'odom', 100)
         self.loops = self.create_publisher(PoseWithCovarianceStamped, 'loop_closures', 100)
         self.create_subscription(PointCloud2, 'points', self._on_points, 100)
@@ -65,7 +73,7 @@ class LidarFrontEnd(Node):
     def _on_points(self, cloud):
         points, _ = self.kiss.register_frame(*points_in(cloud))
         now, stamp = self.kiss.last_pose, cloud.header.stamp
-        self.odometry.publish(said(Odometry(child_frame_id='base_link'), 'odom', stamp, now))
+        self.odometry.publish(filled(Odometry(child_frame_id='base_link'), 'odom', stamp, now))
         self.way += np.linalg.norm(self.kiss.last_delta[:3, 3])
         if self.began is None or self.way > WAY:
             self._look_back()
@@ -73,7 +81,7 @@ class LidarFrontEnd(Node):
         self.map.integrate_frame(points, np.linalg.inv(self.began[1]) @ now)
 
     def _look_back(self):
-        """End a map, which lies in the frame of its first cloud; find the earlier ones in it."""
+        """End a local map, in the frame of its first cloud; look for the place in earlier ones."""
         if self.began is None:
             return
         points = self.map.point_cloud()
@@ -88,7 +96,7 @@ class LidarFrontEnd(Node):
                     voxel_down_sample(points, CELL), there, np.linalg.inv(found.pose), 2.0, CELL)
                 loop = PoseWithCovarianceStamped()
                 loop.pose.covariance = np.diag(np.repeat(SIGMAS, 3) ** 2).ravel()
-                self.loops.publish(said(
+                self.loops.publish(filled(
                     loop, f'base_link@{before.sec}.{before.nanosec:09d}', self.began[0], pose))
         self.maps.append((self.began[0], points))
 
