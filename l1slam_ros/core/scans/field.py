@@ -12,11 +12,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.search_kernels import ACROSS, WIDTH
 
+Likelihoods = NDArray[np.uint8]
 # [m] Cells of the look-up, and how far it reaches.
 RESOLUTION, REACH = 0.1, 0.6
 # The widest bound of a search is over 2^_HEIGHT cells each way.
@@ -37,7 +39,7 @@ class Field:
 
     xy: Array
     normals: Array
-    nearest: Indices
+    nearest: NDArray[np.int32]
     square: Array
     origin: Array
 
@@ -55,14 +57,14 @@ class Field:
         return Field(xy, np.ascontiguousarray(normals), nearest, square, origin)
 
     @cached_property
-    def likelihood(self) -> Array:
+    def likelihood(self) -> Likelihoods:
         """How well a point in each cell fits, (a, b): exp(-d^2 / (2 RESOLUTION^2)) of 255."""
         # Beyond reach this is less than half of one.
         fit = np.exp(self.square.astype(np.float32) * np.float32(-0.5 / RESOLUTION**2))
         return np.rint(CERTAIN * fit).astype(np.uint8)
 
     @cached_property
-    def levels(self) -> Array:
+    def levels(self) -> Likelihoods:
         """
         The greatest likelihood over 1, 2, 4, ... cells from each cell on, (h + 1, a, b).
 
@@ -79,7 +81,7 @@ class Field:
         return levels
 
     @cached_property
-    def blocks(self) -> Array:
+    def blocks(self) -> Likelihoods:
         """
         The last of the `levels`, so that cells which are `WIDTH` apart are neighbours.
 
