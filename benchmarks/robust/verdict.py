@@ -136,7 +136,9 @@ _DRAWN: dict[str, Callable[[np.random.Generator], Place]] = {
     'streets': drawn.streets, 'laps': drawn.laps, 'spokes': drawn.spokes, 'lawn': drawn.lawn,
     'rings': lambda rng: _ring(int(rng.integers(10**6)), rng.random() < 0.3),
     'corridors': lambda rng: _corridor(int(rng.integers(10**6)), rng.random() < 0.3)}
-_FITTED, _LOOKED_AT, _NEVER_SEEN = 1, (2, 3), 4
+_FITTED = 1
+_LOOKED_AT = 2, 3
+_NEVER_SEEN = 4
 
 
 def runs_drawn(base: int, count: int) -> Iterator[Row]:

@@ -13,7 +13,6 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,13 +64,13 @@ def solve(arguments: argparse.Namespace) -> Ending:
     asked = asked_of(arguments)
     keep_freed_memory()
     record, made = _read(arguments)
-    return solved(arguments, asked, record, made,
-                  partial(_doubt_parts, record.graph) if made else _as_it_is)
+    return solved(arguments, asked, record, made)
 
 
 def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphRecord,
            made: 'ScanMap | None',
-           settled: Callable[[Outcome], tuple[Outcome, list[str]]]) -> Ending:
+           settled: Callable[[Outcome], tuple[Outcome, list[str]]] = lambda outcome: (outcome, []),
+           ) -> Ending:
     """
     Optimise a graph that was read; print, write and draw what came out.
 
@@ -88,6 +87,8 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
     measure_by(free_memory)
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome, sentences = settled(_outcome(arguments, record, asked))
+    if made:
+        outcome = _with_parts_doubted(record.graph, outcome)
     remarks = [*_remarks(outcome), *sentences,
                *offset_sentence(record.graph.manifold, outcome.offset)]
     warn(remarks, arguments.quiet)
@@ -124,23 +125,19 @@ def _read(arguments: argparse.Namespace) -> tuple[GraphRecord, 'ScanMap | None']
     return made.record, made
 
 
-def _as_it_is(outcome: Outcome) -> tuple[Outcome, list[str]]:
-    return outcome, []
-
-
-def _doubt_parts(graph: FactorGraph, outcome: Outcome) -> tuple[Outcome, list[str]]:
+def _with_parts_doubted(graph: FactorGraph, outcome: Outcome) -> Outcome:
     """
-    Doubt a map that is in several parts although it is of one drive past scans.
+    Return the outcome of a drive past scans, doubted if its map is in several parts.
 
     A graph may be of several sessions, which need not meet. In a drive, the place of a part that
     no accepted loop joins is where the front end lost its way, and a guess.
     """
     judgement = outcome.judgement
     if judgement is None or outcome.parts == 1:
-        return outcome, []
+        return outcome
     part = component_labels(graph.subset(judgement.accepted))
     doubts = *judgement.doubts, doubt_of_parts(graph.between, part)
-    return replace(outcome, judgement=replace(judgement, doubts=doubts)), []
+    return replace(outcome, judgement=replace(judgement, doubts=doubts))
 
 
 def _remarks(outcome: Outcome) -> Iterator[str]:

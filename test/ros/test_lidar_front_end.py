@@ -29,7 +29,10 @@ from l1slam_ros.ros.shell.header import header
 
 EXAMPLE = Path(__file__).parents[2] / 'config' / 'lidar_front_end.py'
 BLOCK, STREET = np.array((70.0, 50.0)), 14.0  # [m] from block to block, and between houses
-RAYS, SLOPES, RANGE, HEIGHT = 300, np.tan(np.radians(np.linspace(-20, 12, 32))), 60.0, 1.8
+RAYS = 300
+SLOPES = np.tan(np.radians(np.linspace(-20, 12, 32)))
+RANGE = 60.0
+HEIGHT = 1.8
 CORNER = 6.0  # [m] radius
 LAPS, SEEN_AGAIN = 295, 230  # clouds, and from which on the map has seen the street before
 

@@ -193,7 +193,7 @@ class Judgement:
             settled=not robust or (self.settled and not told and not suspect[known:].any()))
 
 
-def doubt_of(pairs: Indices, n_poses: int, kind: str, detail: str) -> Doubt:
+def doubt_of(pairs: Indices, n_poses: int, kind: str, detail: str = '') -> Doubt:
     """Return a doubt about the loops between pairs of keyframes (k, 2), none: about them all."""
     first, last = (max(int(pairs.min()), 0), int(pairs.max())) if len(pairs) else (0, n_poses - 1)
     return Doubt(kind, len(pairs), first, last, detail, listed(pairs))

@@ -32,6 +32,7 @@ from l1slam_ros.core.robust.judgement import (
     SLIP,
     UNFINISHED,
     Doubt,
+    doubt_of,
     listed,
 )
 from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
@@ -150,10 +151,7 @@ def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
     given = growth.given
-    low = np.maximum(given.low[rows], 0)
-    high = given.high[rows]
-    return Doubt(kind, len(rows), int(low.min()), int(high.max()),
-                 pairs=listed(given.factors.pairs[rows]))
+    return doubt_of(given.factors.pairs[rows], given.graph.n_poses, kind)
 
 
 def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.scans import search_kernels
 from l1slam_ros.core.scans.field import CERTAIN, RESOLUTION, Field
-from l1slam_ros.core.scans.search_kernels import ACROSS, WIDTH
+from l1slam_ros.core.scans.search_kernels import ACROSS, FEW, WIDTH
 
 # [rad] Step of the turns: at 4 m a cell.
 TURN = 0.025
@@ -58,7 +58,7 @@ def search(field: Field, xy: Array, centre: Array, reach: float, turn: float, le
         raise ValueError(f'a search reaches {WIDTH * ACROSS * RESOLUTION / 2} m at most')
     # Where the points would be without a turn at the lowest shift, in cells of the levels.
     start = (centre[:2] - field.origin) / RESOLUTION + WIDTH - most
-    sums = np.zeros((len(turns), across, ACROSS if across > 16 else 16), np.uint16)
+    sums = np.zeros((len(turns), across, ACROSS if across > FEW else FEW), np.uint16)
     cells = np.empty((len(turns), len(points), 2), np.int32)
     search_kernels.add_widest_bounds(
         field.blocks, np.ascontiguousarray(points / RESOLUTION),

@@ -20,8 +20,9 @@ from l1slam_ros.core.kernels.compiled import compiled, loop
 # The widest bounds are over so many shifts each way, a power of two: wider ones are sooner added
 # up, and so loose that ten times as many squares must be looked into.
 WIDTH = 8
-# A search has at most so many squares each way.
+# A search has at most so many squares each way; most have no more than `FEW`.
 ACROSS = 32
+FEW = 16
 
 
 @loop('(u1[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], u2[:, :, ::1], i4[:, :, ::1])')
@@ -31,9 +32,9 @@ def add_widest_bounds(blocks, points, turns, start, sums, cells):
 
     blocks : see `Field.blocks`; points : (n, 2) of the scan, in cells; turns : (t, 2) cosine and
     sine of each; start : (2,) where the scan's (0, 0) lies at the lowest shift, in cells of the
-    levels; sums : (t, a, w) of each turn and so many squares each way, w = 16 or `ACROSS`: of more
-    than a nobody asks, but so many are added in one step of the processor; cells : (t, n, 2) takes
-    those of the points
+    levels; sums : (t, a, w) of each turn and so many squares each way, w = `FEW` or `ACROSS`: of
+    more than a nobody asks, but so many are added in one step of the processor; cells : (t, n, 2)
+    takes those of the points
     """
     columns, rows, wide = blocks.shape[2], blocks.shape[3], np.uint64(sums.shape[2])
     for t in range(len(turns)):

@@ -272,9 +272,13 @@ def spare(graph: FactorGraph) -> int:
 
 
 def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
-    manifold = graph.manifold
-    for part in (manifold.ROTATION, manifold.TRANSLATION):
-        system = linearise(graph, poses).part(part)
-        x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
-        poses = step_part(graph, poses, x, part)
+    for part in (graph.manifold.ROTATION, graph.manifold.TRANSLATION):
+        poses = linear_step(graph, poses, cholesky, part)
     return poses
+
+
+def linear_step(graph: FactorGraph, poses: Array, cholesky: BlockCholesky, part: slice) -> Array:
+    """Return poses (n, p) after one least squares step of their rotations or translations."""
+    system = linearise(graph, poses).part(part)
+    x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
+    return step_part(graph, poses, x, part)

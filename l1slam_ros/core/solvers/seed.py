@@ -45,7 +45,7 @@ from l1slam_ros.core.graph.linear_system import (
 from l1slam_ros.core.graph.spanning_tree import odometry_poses, tree_poses
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
-from l1slam_ros.core.solvers.gauss_newton import FITS, ROUGH_L2, minimise_l2, spare
+from l1slam_ros.core.solvers.gauss_newton import FITS, ROUGH_L2, linear_step, minimise_l2, spare
 from l1slam_ros.core.solvers.interior_point import interior_point
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions
@@ -71,7 +71,7 @@ _LARGEST, _TURNED = 8.0, 0.1
 
 
 def seed_poses(graph: FactorGraph, cholesky: BlockCholesky | None,
-               check: Callable[[], None] = lambda: None) -> Array:
+               check: Callable[[], None] = lambda: None, chordal: Array | None = None) -> Array:
     """
     Return the poses of Algorithm 3, (n, p).
 
@@ -82,9 +82,10 @@ def seed_poses(graph: FactorGraph, cholesky: BlockCholesky | None,
     ----------
     cholesky : of the graph; None: by the primal-dual method alone
     check : called on the way, raises where the work shall stop
+    chordal : see `chordal_poses`, if the caller has them; None: they are found here
 
     """
-    references = [placed(graph, poses) for poses in _references(graph, cholesky)]
+    references = [placed(graph, poses) for poses in _references(graph, cholesky, chordal)]
     costs = [_rotation_cost(graph, poses) for poses in references]
     order = [k for k in np.argsort(costs, kind='stable') if costs[k] <= _NEAR * min(costs)]
     candidates: list[Array] = []
@@ -106,28 +107,24 @@ def first_poses(graph: FactorGraph, cholesky: BlockCholesky,
 
     Arguments as those of `seed_poses`.
     """
+    chordal = None
     if len(graph.between) * graph.manifold.TANGENT_SIZE > _MANY_ROWS:
-        poses = _clean_map(graph, cholesky, check)
+        chordal = chordal_poses(graph, cholesky)
+        poses = None if chordal is None else _clean_map(graph, chordal, cholesky, check)
         if poses is not None:
             return poses
-    return seed_poses(graph, cholesky, check)
+    return seed_poses(graph, cholesky, check, chordal)
 
 
-def _clean_map(graph: FactorGraph, cholesky: BlockCholesky,
+def _clean_map(graph: FactorGraph, chordal: Array, cholesky: BlockCholesky,
                check: Callable[[], None]) -> Array | None:
     """
-    Return the L2 map (n, p) that the chordal relaxation leads to; None: it is not a clean one.
+    Return the L2 map (n, p) that `chordal_poses` lead to; None: it is not a clean one.
 
     Where rotations end a turn off, or loops lie, some residuals are out of all proportion.
     """
-    chordal = chordal_poses(graph, cholesky)
-    if chordal is None:
-        return None
     check()
-    poses = placed(graph, chordal)
-    system = translation_system(graph, poses)
-    x = weighted_least_squares(system, cholesky, np.ones(len(system.b)))
-    poses = step_part(graph, poses, x, graph.manifold.TRANSLATION)
+    poses = linear_step(graph, placed(graph, chordal), cholesky, graph.manifold.TRANSLATION)
     found = minimise_l2(graph, poses, ROUGH_L2, cholesky, lambda *_: check())
     whitened = whitened_residual(graph, found.poses)
     largest = _LARGEST * np.sqrt(found.cost / len(whitened))
@@ -138,9 +135,11 @@ def _clean_map(graph: FactorGraph, cholesky: BlockCholesky,
     return found.poses if is_clean else None
 
 
-def _references(graph: FactorGraph, cholesky: BlockCholesky | None) -> list[Array]:
+def _references(graph: FactorGraph, cholesky: BlockCholesky | None,
+                chordal: Array | None) -> list[Array]:
     """Return poses from which the rotations may be found, (n, p) each, the likeliest first."""
-    chordal = None if cholesky is None else chordal_poses(graph, cholesky)
+    if chordal is None and cholesky is not None:
+        chordal = chordal_poses(graph, cholesky)
     first = tree_poses(graph, graph.n_poses // 2) if chordal is None else chordal
     references = [first, tree_poses(graph, 0)]
     if graph.between.is_odometry.sum() == graph.n_poses - 1:
