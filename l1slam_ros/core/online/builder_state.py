@@ -44,57 +44,38 @@ class TrackEnd:
 
 
 @dataclass(frozen=True)
-class BuilderState:
+class LoopsState:
     """
-    The state of a graph builder, from which another one continues.
+    The loops that have come.
 
-    graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; offset, end,
-    end_pose, end_covariance : of the first robot, see `TrackEnd`; loop_rows (k,),
-    loop_stamps (k, 2) and expired (l, 2) [ns] : see `GraphBuilder`; waiting : loops, and how long
-    each has waited [ns]; seen : of each loop that came, by its identity, its factor, -1 for none;
-    struck_pairs (s, 2) : the keyframes between which loops are struck out, those to come too;
-    robot : the number of the first robot; others : the ends of the other ones; loop_robots (k, 2),
-    expired_robots (l, 2) : whose times the stamps of loops are, none: those of the first robot.
+    rows (k,) : which between factors are loops; stamps (k, 2) [ns], reference and end, of those;
+    expired (l, 2) [ns] : of those that came to nothing; robots (k, 2), expired_robots (l, 2) :
+    whose times these are; waiting : loops that wait, and how long each has waited [ns]; seen : of
+    each loop that came, by its identity, its factor, -1 for none; struck_pairs (s, 2) : the
+    keyframes between which loops are struck out, those to come too
     """
 
-    graph: FactorGraph
+    rows: Indices
     stamps: Indices
-    odometry: Array
-    offset: Array
-    end: int
-    end_pose: Array
-    end_covariance: Array
-    loop_rows: Indices
-    loop_stamps: Indices
+    robots: Indices
     expired: Indices
+    expired_robots: Indices
     waiting: tuple[tuple[LoopClosure, int], ...]
     seen: Mapping[bytes, int]
     struck_pairs: Indices
-    robot: int = 0
-    others: tuple[TrackEnd, ...] = ()
-    loop_robots: Indices | None = None
-    expired_robots: Indices | None = None
 
-    @property
-    def ends(self) -> tuple[TrackEnd, ...]:
-        """Where the odometry of each robot has come to."""
-        return TrackEnd(self.robot, self.offset, self.end, self.end_pose,
-                        self.end_covariance), *self.others
+    @staticmethod
+    def of_graph(graph: FactorGraph, stamps: Indices) -> 'LoopsState':
+        """Return that of a graph alone, of one robot; stamps : of its keyframes [ns]."""
+        pairs = graph.between.pairs
+        rows = np.flatnonzero(~graph.between.is_odometry)
+        none = np.zeros((0, 2), np.int64)
+        return LoopsState(
+            rows, np.sort(stamps[pairs[rows]], axis=1), np.zeros((len(rows), 2), np.int64), none,
+            none, (), {}, np.sort(pairs[graph.between.struck], axis=1))
 
-    def renumbered(self, number: Callable[[int], int]) -> 'BuilderState':
-        """Return the state where robots have other numbers."""
-        def turned(robots: Indices) -> Indices:
-            return np.array([number(one) for one in robots.ravel().tolist()], np.int64).reshape(
-                robots.shape)
-
-        graph = self.graph.copy()
-        give_to(graph, turned(graph.robot))
-        first, *others = sorted((replace(end, robot=number(end.robot)) for end in self.ends),
-                                key=lambda end: end.robot)
-        loops, expired = (
-            turned(np.full((k, 2), self.robot) if robots is None else robots) for robots, k in (
-                (self.loop_robots, len(self.loop_rows)),
-                (self.expired_robots, len(self.expired))))
+    def renumbered(self, number: Callable[[int], int]) -> 'LoopsState':
+        """Return the same where robots have other numbers."""
         waiting = tuple((replace(loop, robot=number(loop.robot),
                                  reference_robot=number(loop.robots[0])), age)
                         for loop, age in self.waiting)
@@ -103,17 +84,42 @@ class BuilderState:
             one, other = np.frombuffer(key[_IDENTITY:], np.int64).tolist() or (0, 0)
             seen[key_of(key[:_IDENTITY], (number(one), number(other)))] = row
         return replace(
-            self, graph=graph, robot=first.robot, offset=first.offset, end=first.end,
-            end_pose=first.end_pose, end_covariance=first.end_covariance, others=tuple(others),
-            loop_robots=loops, expired_robots=expired, waiting=waiting, seen=seen)
+            self, robots=_turned(self.robots, number), waiting=waiting, seen=seen,
+            expired_robots=_turned(self.expired_robots, number))
+
+
+@dataclass(frozen=True)
+class BuilderState:
+    """
+    The state of a graph builder, from which another one continues.
+
+    graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; ends : of the
+    odometry of each robot, by their numbers; loops : those that have come
+    """
+
+    graph: FactorGraph
+    stamps: Indices
+    odometry: Array
+    ends: tuple[TrackEnd, ...]
+    loops: LoopsState
 
     @staticmethod
     def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'BuilderState':
         """Return that of a graph alone, whose odometry went from pose to pose (n, p)."""
         d = graph.manifold.TANGENT_SIZE
-        none = np.zeros((0, 2), np.int64)
-        loops = np.flatnonzero(~graph.between.is_odometry)
-        ends = np.sort(stamps[graph.between.pairs[loops]], axis=1)
-        struck = np.sort(graph.between.pairs[graph.between.struck], axis=1)
-        return BuilderState(graph, stamps, poses, graph.manifold.identity(1), int(stamps[-1]),
-                      poses[-1:], np.zeros((d, d)), loops, ends, none, (), {}, struck)
+        end = TrackEnd(0, graph.manifold.identity(1), int(stamps[-1]), poses[-1:],
+                       np.zeros((d, d)))
+        return BuilderState(graph, stamps, poses, (end,), LoopsState.of_graph(graph, stamps))
+
+    def renumbered(self, number: Callable[[int], int]) -> 'BuilderState':
+        """Return the state where robots have other numbers."""
+        graph = self.graph.copy()
+        give_to(graph, _turned(graph.robot, number))
+        ends = sorted((replace(end, robot=number(end.robot)) for end in self.ends),
+                      key=lambda end: end.robot)
+        return replace(self, graph=graph, ends=tuple(ends), loops=self.loops.renumbered(number))
+
+
+def _turned(robots: Indices, number: Callable[[int], int]) -> Indices:
+    return np.array([number(one) for one in robots.ravel().tolist()], np.int64).reshape(
+        robots.shape)

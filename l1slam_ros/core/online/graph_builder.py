@@ -142,31 +142,23 @@ class GraphBuilder:
 
     def grown(self) -> BuilderState:
         """Return the state from which another builder continues; there is a keyframe at least."""
-        shared, loops = self._shared, self.loops
-        tracks = shared.tracks
-        (in_graph, _, expired), (own, _, of_expired) = loops.stamps, loops.robots
-        ends = [self.robots[robot].end() for robot in tracks.begun]
-        first, *others = ends
-        # With the first robot alone all is its own.
-        whose = (own, of_expired) if others or first.robot else (None, None)
+        tracks = self._shared.tracks
         return BuilderState(
-            self.graph.copy(), self.keyframe_stamps, self.keyframe_poses, first.offset,
-            first.end, first.end_pose, first.end_covariance, loops.rows, in_graph, expired,
-            loops.waiting.arrivals(tracks.clocks), loops.seen(), loops.struck_pairs,
-            first.robot, tuple(others), *whose)
+            self.graph.copy(), self.keyframe_stamps, self.keyframe_poses,
+            tuple(self.robots[robot].end() for robot in tracks.begun), self.loops.state(tracks))
 
     def restore(self, state: BuilderState) -> None:
         """Continue where a run ended; odometry that does not continue there begins a new part."""
         self._shared.begin(state.graph)
         # In a file a loop across a gap looks like odometry.
         steps = self.graph.between.step_to
-        firsts = np.flatnonzero((steps[1:] < 0) | np.isin(steps[1:], state.loop_rows)) + 1
+        firsts = np.flatnonzero((steps[1:] < 0) | np.isin(steps[1:], state.loops.rows)) + 1
         self.graph.follow(firsts, NO_PREDECESSOR)
         for end in state.ends:
             of_robot = np.flatnonzero(self.graph.robot == end.robot)
             self._odometry_of(end.robot).restore(
                 end, state.stamps[of_robot], state.odometry[of_robot], of_robot, firsts)
-        self.loops.restore(state, self._shared.tracks, self.options.loop)
+        self.loops.restore(state.loops, self._shared.tracks, self.options.loop)
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure or an absolute pose in, once; see `add_due_loops`."""

@@ -22,21 +22,17 @@ from typing import Any, TypeVar
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.graph.parts import give_to
-from l1slam_ros.core.online.builder_state import BuilderState, TrackEnd
+from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.snapshot import SavedMap
 from l1slam_ros.io.files import other_kind, put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph_file
 from l1slam_ros.io.graphs.left_out import SUSPECT, left_out_by
+from l1slam_ros.io.graphs.saved_builder import restored, values_of
 from l1slam_ros.io.remarks import is_proven, with_remarks
 
-# What a builder's state holds beside the state of a single robot.
-_OF_ROBOTS = ('robot', 'others', 'loop_robots', 'expired_robots')
-
-_Record = TypeVar('_Record', BuilderState, Optimised, Judgement)
+_Record = TypeVar('_Record', Optimised, Judgement)
 
 
 def save_map(path: Path, saved: SavedMap | None) -> str:
@@ -150,42 +146,14 @@ def _left_out(saved: SavedMap) -> np.ndarray:
 
 def _remarks(saved: SavedMap) -> dict[str, Any]:
     """Return, by name, the values of the state for which g2o has no tag."""
-    state, judgement = saved.builder, saved.judgement
+    factors, judgement = saved.builder.graph.between, saved.judgement
     values = {f.name: getattr(record, f.name)
-              for record in (state, saved.optimised, judgement) for f in fields(record)}
-    for name in 'graph', 'poses', *_OF_ROBOTS:
-        del values[name]
+              for record in (saved.optimised, judgement) for f in fields(record)}
+    del values['poses']
     names = {'robots': list(saved.robots)} if saved.robots else {}
-    return values | _of_robots(state) | names | {
+    return values_of(saved.builder) | values | names | {
         'doubts': [asdict(doubt) for doubt in judgement.doubts], 'robust': saved.robust,
-        'trusted': state.graph.between.trusted, 'struck': state.graph.between.struck,
-        'seen': [[key.hex(), state.seen[key]] for key in sorted(state.seen)],
-        'waiting': [[loop.reference_stamp, loop.stamp, loop.trusted, loop.struck, age,
-                     loop.pose3.tolist(), loop.covariance.tolist(),
-                     *(loop.robots if any(loop.robots) else ())]
-                    for loop, age in state.waiting]}
-
-
-def _of_robots(state: BuilderState) -> dict[str, Any]:
-    """Return, by name, the robots of keyframes and loops; empty for a map of one robot."""
-    if not (state.others or state.robot):
-        return {}
-    return {'keyframe_robots': state.graph.robot, 'robot': state.robot,
-            'others': [[end.robot, end.offset.tolist(), end.end, end.end_pose.tolist(),
-                        end.end_covariance.tolist()] for end in state.others],
-            'loop_robots': state.loop_robots, 'expired_robots': state.expired_robots}
-
-
-def _with_robots(state: BuilderState, values: dict[str, Any]) -> BuilderState:
-    """Return a state with the saved ownership of its keyframes and loops by robot."""
-    give_to(state.graph, np.array(values['keyframe_robots']))
-    others = tuple(
-        TrackEnd(robot, np.array(offset), end, np.array(pose), np.array(covariance))
-        for robot, offset, end, pose, covariance in values['others'])
-    loops, expired = (np.array(values[name], np.int64).reshape(-1, 2)
-                      for name in ('loop_robots', 'expired_robots'))
-    return replace(state, robot=values['robot'], others=others, loop_robots=loops,
-                   expired_robots=expired)
+        'trusted': factors.trusted, 'struck': factors.struck}
 
 
 def _read(path: Path) -> SavedMap:
@@ -199,22 +167,12 @@ def _read(path: Path) -> SavedMap:
     values = dict(record.remarks or {})
     if not values:
         return SavedMap(state, optimised, Judgement.nothing(), True)
-    waiting = tuple(
-        (LoopClosure(reference, stamp, np.array(pose3), np.array(covariance), trusted, struck,
-                     *robots[::-1]), age)
-        for reference, stamp, trusted, struck, age, pose3, covariance, *robots
-        in values.pop('waiting'))
-    seen = {bytes.fromhex(key): row for key, row in values.pop('seen')}
     doubts = tuple(
         Doubt(**doubt | {'pairs': tuple((i, j) for i, j in doubt.get('pairs', ()))})
-        for doubt in values.pop('doubts'))
-    judgement = replace(_restored(Judgement.nothing(), values), doubts=doubts)
-    if 'keyframe_robots' in values:
-        state = _with_robots(state, values)
-        values = {name: value for name, value in values.items() if name not in _OF_ROBOTS}
-    return SavedMap(replace(_restored(state, values), waiting=waiting, seen=seen),
-                    _restored(optimised, values), judgement, values['robust'],
-                    robots=tuple(values.get('robots', ())))
+        for doubt in values['doubts'])
+    judgement = _restored(Judgement.nothing(), values | {'doubts': doubts})
+    return SavedMap(restored(state, values), _restored(optimised, values), judgement,
+                    values['robust'], robots=tuple(values.get('robots', ())))
 
 
 def _restored(record: _Record, values: dict[str, Any]) -> _Record:

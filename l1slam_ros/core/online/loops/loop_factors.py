@@ -27,7 +27,7 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LoopClosure, Notes
-from l1slam_ros.core.online.builder_state import BuilderState, key_of
+from l1slam_ros.core.online.builder_state import LoopsState, key_of
 from l1slam_ros.core.online.keyframes import diagonal_covariance, reduced_covariance
 from l1slam_ros.core.online.loops.carried import carried
 from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop, WaitingLoops
@@ -115,24 +115,19 @@ class LoopFactors:
         """Which between factors of the graph are loops, (k,)."""
         return self._rows.view()
 
-    @property
-    def struck_pairs(self) -> Indices:
-        """The keyframes between which loops are struck out, those to come too, (k, 2)."""
-        return np.array(sorted(self._struck), np.int64).reshape(-1, 2)
+    def state(self, tracks: Tracks) -> LoopsState:
+        """Return the loops from which another run continues."""
+        in_graph, _, expired = self.stamps
+        own, _, of_expired = self.robots
+        return LoopsState(
+            self.rows, in_graph, own, expired, of_expired, self.waiting.arrivals(tracks.clocks),
+            self._row_of.copy(), np.array(sorted(self._struck), np.int64).reshape(-1, 2))
 
-    def seen(self) -> dict[bytes, int]:
-        """Return of each loop that came, by its identity, its factor, -1 for none."""
-        return self._row_of.copy()
-
-    def restore(self, state: BuilderState, tracks: Tracks, options: LoopOptions) -> None:
+    def restore(self, state: LoopsState, tracks: Tracks, options: LoopOptions) -> None:
         """Go on with the loops of an earlier run."""
-        none = np.full((len(state.loop_rows), 2), state.robot)
-        self._note(state.loop_rows, state.loop_stamps,
-                   none if state.loop_robots is None else state.loop_robots)
+        self._note(state.rows, state.stamps, state.robots)
         self._expired.extend(state.expired)
-        self._expired_robots.extend(
-            np.full(state.expired.shape, state.robot) if state.expired_robots is None
-            else state.expired_robots)
+        self._expired_robots.extend(state.expired_robots)
         for loop, age in state.waiting:
             self.add(loop, tracks, options, age)
         self._row_of.update(state.seen)
