@@ -178,6 +178,9 @@ def check_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
 
     """
     suffix = path.suffix.lower()
+    if path.name == '-':
+        raise FileError(path, 'nothing is written to standard output; expected the name of a file '
+                        'or of a bag directory')
     if suffix not in ('.g2o', *JRL_SUFFIXES, '.tum', ''):
         raise FileError(path, f'unknown suffix; expected .g2o, {", ".join(JRL_SUFFIXES)}, .tum, '
                         'or none for a bag directory')

@@ -114,6 +114,14 @@ def test_a_graph_of_a_user_stays_as_it_is(capsys, users, tmp_path, lies):
     assert users.read_bytes() != before
 
 
+def test_a_hyphen_is_not_taken_for_a_name(capsys, users, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for command in ('convert', users, '-'), ('solve', users, '--output', '-'):
+        out, err = run(capsys, *command, code=2)
+        assert out == '' and 'nothing is written to standard output' in err
+    assert [path.name for path in tmp_path.iterdir()] == ['users.g2o']
+
+
 @pytest.mark.parametrize('what', ['stamps', 'trusted', 'struck', 'truth', 'false'])
 def test_what_lies_beside_a_graph_is_a_users_too(capsys, tmp_path, what):
     output = tmp_path / 'a.g2o'
