@@ -17,7 +17,7 @@ It knows no back end: whoever has one tells it with `place` where the keyframes 
 """
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from l1slam_ros.core.scans.loops import LoopFinder, LoopOptions, ScanLoop
 from l1slam_ros.core.scans.odometry import ScanKeyframes, ScanOdometry, Step
 from l1slam_ros.core.scans.points import Mount, Scan, points_of
 from l1slam_ros.core.scans.submaps import Keyframe
+from l1slam_ros.core.scans.wheels import Wheels
 
 # Where so many comparisons wait, two are made at a time, and no keyframe asks for more.
 _MANY = 8
@@ -59,8 +60,7 @@ class ScanFrontEnd:
         self._finder = LoopFinder(self._odometry.keyframes, options.loop)
         self._poses, self._spread = np.zeros((0, 3)), np.zeros((0, 2))
         self._due: deque[int] = deque()
-        self._velocity: Array | None = None
-        self._last: tuple[int, Array] | None = None
+        self._wheels = Wheels()
 
     @property
     def keyframes(self) -> list[Keyframe]:
@@ -69,18 +69,15 @@ class ScanFrontEnd:
 
     def add(self, scan: Scan, wheels: Array) -> Step:
         """Follow the robot to a scan; wheels : (3,) its pose by the wheels at the scan's stamp."""
-        if self._last is not None:
-            seconds = (scan.stamp - self._last[0]) * 1e-9
-            moved = se2.between(self._last[1][None], wheels[None])[0]
-            self._velocity = moved / seconds if seconds > 0 else None
-        self._last = scan.stamp, wheels
-        return self._odometry.add(scan.stamp, points_of(scan, self._mount, self._velocity), wheels)
+        jump = self._wheels.follow(scan.stamp, wheels)
+        points = points_of(scan, self._mount, self._wheels.velocity)
+        step = self._odometry.add(scan.stamp, points, self._wheels.pose)
+        return replace(step, said='; '.join(filter(None, (jump, step.said)))) if jump else step
 
     def begin_drive(self, mount: Mount) -> None:
         """Let the next scan be the first of another drive, by a laser mounted like this."""
         self._mount = mount
-        self._velocity = None
-        self._last = None
+        self._wheels = Wheels()
         self._odometry.end_drive()
 
     def place(self, poses: Array, spread: Array) -> None:

@@ -14,6 +14,7 @@ that of the scans; without it the laser is taken to be at the robot's origin, wi
 """
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,13 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.geometry import se2, se3
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.scans.points import Mount, Scan
 from l1slam_ros.io.bags.reader import bag_summary, read_messages
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.messages.conversion import odometry_sample, stamp_of
 from l1slam_ros.io.scans.laser_log import LaserLog, wheels_at
+from l1slam_ros.io.scans.log_stamps import not_falling, set_forward
 
 SCAN = 'sensor_msgs/msg/LaserScan'
 _STATIC = '/tf_static'
@@ -52,19 +54,18 @@ def read_bag_scans(path: Path, odom_topic: str, scan_topic: str) -> LaserLog:
     if len(taken.stamps) < 2:
         raise FileError(path, f'{counted(len(taken.stamps), "message")} of odometry on '
                         f'{odom_topic}; expected 2 or more')
-    order = np.argsort([scan.stamp for scan in taken.scans], kind='stable')
-    scans = [taken.scans[k] for k in order]
-    rising = np.flatnonzero(np.diff(taken.stamps, prepend=taken.stamps[0] - 1) > 0)
-    stamps, poses = np.array(taken.stamps)[rising], np.array(taken.poses)[rising]
-    wheels, rows = wheels_at(stamps, poses, np.array([scan.stamp for scan in scans]))
-    if not len(rows):
+    stamps, scans, shifted = taken.in_order()
+    rows = not_falling(stamps.tolist())
+    wheels, found = wheels_at(
+        stamps[rows], np.array(taken.poses)[rows], np.array([scan.stamp for scan in scans]))
+    if not len(found):
         raise FileError(path, f'no scan on {scan_topic} lies between two messages on '
                         f'{odom_topic}; expected stamps of one clock')
-    out = len(scans) - len(rows)
+    out = len(taken.scans) - len(found)
     skipped = [f'{counted(out, "scan")} left out: no odometry surrounds them'] if out else []
     mount, said = taken.mount()
-    return LaserLog([scans[row] for row in rows], wheels, mount,
-                    (*skipped, *said, *taken.refused), '; '.join(damage))
+    return LaserLog([scans[row] for row in found], wheels, mount,
+                    (*shifted, *skipped, *said, *taken.refused), '; '.join(damage))
 
 
 class _Taken:
@@ -74,6 +75,8 @@ class _Taken:
         self.scans: list[Scan] = []
         self.stamps: list[int] = []
         self.poses: list[Array] = []
+        # Of each scan, how many messages of odometry stand before it in the bag.
+        self._before: list[int] = []
         self.refused: list[str] = []
         self._frame = self._base = ''
         self._transforms: dict[str, tuple[str, Array]] = {}
@@ -88,6 +91,7 @@ class _Taken:
             elif is_scan:
                 self._frame = message.data.header.frame_id.removeprefix('/')
                 self.scans.append(scan_of(message.data))
+                self._before.append(len(self.stamps))
             else:
                 sample = odometry_sample(message.data)
                 self._base = sample.frame.removeprefix('/')
@@ -97,6 +101,20 @@ class _Taken:
             sentence = f'a message on {message.topic} is refused: {error}'
             if sentence not in self.refused:
                 self.refused.append(sentence)
+
+    def in_order(self) -> tuple[Indices, list[Scan], tuple[str, ...]]:
+        """Return the stamps of the odometry, the scans in order, and what is said of them."""
+        stamps = np.array(self.stamps, np.int64)
+        going_on, back = set_forward(stamps)
+        if not back:
+            return stamps, sorted(self.scans, key=lambda scan: scan.stamp), ()
+        # A scan is of the same clock as the odometry before it.
+        shifts = (going_on - stamps)[np.maximum(np.array(self._before) - 1, 0)]
+        scans = [replace(scan, stamp=scan.stamp + shift)
+                 for scan, shift in zip(self.scans, shifts.tolist(), strict=True)]
+        return going_on, [scans[row] for row in not_falling([scan.stamp for scan in scans])], (
+            f'the clock was set back by {back * 1e-9:.1f} s in all; stamps are shifted to undo '
+            'that',)
 
     def mount(self) -> tuple[Mount, tuple[str, ...]]:
         """Return the pose of the laser on the robot, and sentences on it."""

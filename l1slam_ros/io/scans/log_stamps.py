@@ -28,13 +28,17 @@ def rising(stamps: Indices) -> tuple[Indices, Indices, int]:
     shifted to undo that. Then the largest set of lines whose stamps do not descend is kept; the
     others were stamped late or early. Equal stamps were rounded; they are spread up to the next.
     """
-    going_on, back = _set_forward(stamps)
-    rows = _not_falling(going_on.tolist())
+    going_on, back = set_forward(stamps)
+    rows = not_falling(going_on.tolist())
     return _spread(going_on[rows]), rows, back
 
 
-def _set_forward(stamps: Indices) -> tuple[Indices, int]:
-    """Undo that the clock was set back; return the stamps and the sum of the shifts [ns]."""
+def set_forward(stamps: Indices) -> tuple[Indices, int]:
+    """
+    Undo that the clock was set back; return the stamps and the sum of the shifts [ns].
+
+    stamps : see `rising`
+    """
     steps: Indices = np.diff(stamps)
     usual = int(np.median(steps[steps > 0])) if (steps > 0).any() else _USUAL
     found = stamps.copy()
@@ -49,7 +53,7 @@ def _set_forward(stamps: Indices) -> tuple[Indices, int]:
     return found, int(found[-1] - stamps[-1])
 
 
-def _not_falling(stamps: list[int]) -> Indices:
+def not_falling(stamps: list[int]) -> Indices:
     """Return the places of the longest sequence of stamps that does not descend."""
     # For each length, the sequence that ends at the lowest stamp.
     ends: list[int] = []

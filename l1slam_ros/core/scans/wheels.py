@@ -1,0 +1,68 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""
+The wheels' odometry as one way: where a driver begins anew it jumps, and the robot does not.
+
+In: the robot's pose by the wheels at stamps that ascend. Out: the same way without jumps, and how
+fast the robot moves. In place of a jump it goes on as it moved before; scans say the rest.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array
+
+# A step is a jump if it is more than so far [m, rad], more than so fast [m/s, rad/s], and so many
+# times as far as the robot moved before: wheels that slip, or turn at once, do none.
+_FAR = np.array((0.5, 0.8))
+_FAST = np.array((3.0, 3.0))
+_TIMES = 5.0
+
+
+class Wheels:
+    """
+    Follows the wheels.
+
+    Attributes
+    ----------
+    pose : (3,) of the robot, where jumps are left out
+    velocity : (3,) of the robot in its own axes [m/s, m/s, rad/s]; None where it is not known
+
+    """
+
+    def __init__(self) -> None:
+        self.pose: Array = np.zeros(3)
+        self.velocity: Array | None = None
+        self._last: tuple[int, Array] | None = None
+
+    def follow(self, stamp: int, wheels: Array) -> str:
+        """Go on to a pose (3,) by the wheels at a stamp [ns]; return what is to be said of it."""
+        before, self._last = self._last, (stamp, wheels)
+        if before is None:
+            self.pose = wheels
+            return ''
+        seconds = (stamp - before[0]) * 1e-9
+        moved = se2.between(before[1][None], wheels[None])[0]
+        usual = np.zeros(3) if self.velocity is None else seconds * self.velocity
+        far = np.fmax(seconds * _FAST, _TIMES * _length(usual))
+        said = ''
+        if np.any(_length(moved) > np.fmax(_FAR, far)):
+            metres, radians = _length(moved)
+            said = (f'the wheels jump by {metres:.3g} m and {radians:.2g} rad in {seconds:.3g} s; '
+                    'the robot is taken to go on as before')
+            moved = usual
+        elif seconds > 0:
+            self.velocity = moved / seconds
+        self.pose = se2.compose(self.pose[None], moved[None])[0]
+        return said
+
+
+def _length(motion: Array) -> Array:
+    """Return how far a motion (3,) goes, and how much it turns, (2,) [m, rad]."""
+    return np.array((np.hypot(motion[0], motion[1]), abs(motion[2])))
