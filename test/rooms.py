@@ -153,7 +153,11 @@ def write_log(path, scans, wheels):
 
 
 def write_scan_bag(path, scans, wheels, mount=None):
-    """Write scans, odometry twice as often and where the laser is, by an independent writer."""
+    """
+    Write scans, odometry twice as often and where the laser is, by an independent writer.
+
+    The recorder's clock goes on, whatever the stamps of the scans do.
+    """
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types
     time, head = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
@@ -189,14 +193,15 @@ def write_scan_bag(path, scans, wheels, mount=None):
                     header(scans[0].stamp, 'base_link'), 'laser',
                     types['geometry_msgs/msg/Transform'](vector(x, y, z), quaternion(*q)))]))
         for k, (scan, pose) in enumerate(zip(scans, wheels, strict=True)):
-            put('/wheels', scan.stamp, odometry(scan.stamp, pose))
-            put('/scan', scan.stamp, types['sensor_msgs/msg/LaserScan'](
+            now = scans[0].stamp + k * int(_PERIOD * 1e9)
+            put('/wheels', now, odometry(scan.stamp, pose))
+            put('/scan', now, types['sensor_msgs/msg/LaserScan'](
                 header(scan.stamp, 'laser'), scan.angle_min, 6.28, scan.angle_increment, 0.0, 0.2,
                 scan.range_min, scan.range_max, scan.ranges.astype(np.float32),
                 np.zeros(0, np.float32)))
             if k + 1 < len(scans):
                 between = se2.interpolate(wheels[k][None], wheels[k + 1][None], np.array([0.5]))[0]
-                put('/wheels', scan.stamp + 10**8, odometry(scan.stamp + 10**8, between))
+                put('/wheels', now + 10**8, odometry(scan.stamp + 10**8, between))
 
 
 def write_truth(path, scans, true):

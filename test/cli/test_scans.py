@@ -12,6 +12,7 @@ import bz2
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,6 +102,21 @@ def test_the_scans_of_a_bag_make_the_same_map(drive, truth, tmp_path, capsys):
     again = solved(capsys, bag, '--scans', '/scan', '--odom-topic', '/wheels',
                    '--reference', truth)[1]
     assert {**again, 'seconds': 0} == {**said, 'seconds': 0}, 'nothing goes by the clock'
+
+
+def test_a_clock_that_is_set_back_within_a_bag_is_one_clock_again(drive, tmp_path, capsys):
+    scans, wheels, _ = drive
+    k = len(scans) // 2
+    bags = tmp_path / 'bag', tmp_path / 'back'
+    back = [replace(scan, stamp=scan.stamp - 30 * 10**9) for scan in scans[k:]]
+    for bag, recorded in zip(bags, (scans, [*scans[:k], *back]), strict=True):
+        write_scan_bag(bag, recorded, wheels, mount=((0.0, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0)))
+    (code, said), (again, found) = (
+        solved(capsys, bag, '--scans', '/scan', '--odom-topic', '/wheels') for bag in bags)
+    assert (code, again) == (0, 0)
+    assert found['warnings'] == ['the clock was set back by 30.0 s in all; stamps are shifted to '
+                                 'undo that']
+    assert {**found, 'seconds': 0, 'warnings': []} == {**said, 'seconds': 0}
 
 
 def test_a_laser_that_is_turned_upside_down_and_ahead_is_read_off_the_transforms(

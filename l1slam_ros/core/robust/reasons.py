@@ -38,6 +38,7 @@ from l1slam_ros.core.robust.judgement import (
 from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
 from l1slam_ros.core.robust.pairwise_consistency import (
     agree_at_a_place,
+    longest_run,
     spanned,
     strongest_group,
 )
@@ -59,6 +60,7 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
     if growth.cut.any():
         reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
     reasons += _other_map(growth)
+    reasons += [_doubt(growth, OTHER_MAP, rows) for rows in _joining_otherwise(growth)]
     reasons += [
         _slip_doubt(growth, step)
         for step, odds in growth.slip_odds.items()
@@ -110,6 +112,34 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
             # Rivals that say it otherwise are of the same doubt.
             joins |= own
             yield rows[own]
+
+
+def _joining_otherwise(growth: Growth) -> Iterator[Indices]:
+    """
+    Yield refused loops that agree how two parts lie to each other, otherwise than accepted ones.
+
+    Parts are what no odometry joins, so that loops alone speak for either. What is refused counts
+    where it is of half as many places as what is accepted, or more, or a long run.
+    """
+    given = growth.given
+    part = component_labels(given.graph.subset(~given.is_loop & ~growth.cut))
+    if not part.max(initial=0):
+        return
+    ends = np.sort((part[given.low], part[given.high]), axis=0)
+    rows = np.flatnonzero((ends[0] != ends[1]) & ~given.factors.is_absolute)
+    _, pair = np.unique(ends[:, rows], axis=1, return_inverse=True)
+    pair = pair.ravel()
+    refused = np.isin(rows, growth.undecided())
+    for number in np.unique(pair[refused]):
+        own = pair == number
+        known = len(np.unique(given.place[rows[own & growth.accepted[rows]]]))
+        if not known:
+            continue
+        group = strongest_group(growth, rows[own & refused])
+        if 2 * len(group.places) < known:
+            group = longest_run(growth, rows[own & refused])
+        if len(group.rows):
+            yield group.rows
 
 
 def _other_map(growth: Growth) -> list[Doubt]:

@@ -20,7 +20,7 @@ from l1slam_ros.core.geometry.manifold import Array
 
 # A step is a jump if it is more than so far [m, rad], more than so fast [m/s, rad/s], and so many
 # times as far as the robot moved before: wheels that slip, or turn at once, do none.
-_FAR = np.array((0.5, 0.8))
+_FAR = np.array((1.0, 1.0))
 _FAST = np.array((3.0, 3.0))
 _TIMES = 5.0
 

@@ -182,3 +182,24 @@ def test_half_a_map_that_says_it_is_elsewhere_is_doubtful_unless_loops_contradic
     assert not found.accepted[lies if contradicted else lies[~across]].any()
     assert (OTHER_MAP in [doubt.kind for doubt in found.doubts]) == (not contradicted)
     assert not contradicted or found.confidence > 0.9
+
+
+@pytest.mark.parametrize('run, doubted', [(20, True), (0, False)])
+def test_a_long_run_between_two_parts_against_several_places_is_doubtful(run, doubted):
+    """Two laps that no odometry joins; places opposite each other look alike, one way is seen."""
+    n = 120
+    angle = 2 * np.pi * np.arange(2 * n) / n
+    truth = np.column_stack((20 * np.cos(angle), 20 * np.sin(angle), angle))
+    chain, seen = chain_of(2 * n), np.arange(10, 10 + run)
+    alike = np.arange(12, 60, 8)
+    pairs = np.concatenate((np.delete(chain, n - 1, axis=0),
+                            np.column_stack((seen, seen + n)),
+                            np.column_stack((alike, alike + n))))
+    noise = np.random.default_rng(2).standard_normal((len(pairs), 3)) * [0.02, 0.02, 0.002]
+    graph = graph_of(truth, pairs, noise, np.diag([2500.0, 2500.0, 250_000.0]))
+    # The second keyframe of such a pair is said to be where the robot was half a lap later.
+    graph.between.j[-len(alike):] = n + (alike + n // 2) % n
+    found, _ = robust_solve(graph)
+    refused = np.flatnonzero(~found.accepted) - (len(pairs) - len(alike) - run)
+    assert set(refused) == set(range(run))
+    assert [doubt.kind for doubt in found.doubts] == [OTHER_MAP] * doubted
