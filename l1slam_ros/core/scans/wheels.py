@@ -53,9 +53,7 @@ class Wheels:
         far = np.fmax(seconds * _FAST, _TIMES * _length(usual))
         said = ''
         if np.any(_length(moved) > np.fmax(_FAR, far)):
-            metres, radians = _length(moved)
-            said = (f'the wheels jump by {metres:.3g} m and {radians:.2g} rad in {seconds:.3g} s; '
-                    'the robot is taken to go on as before')
+            said = 'the wheels jump further than a robot moves; it is taken to go on as before'
             moved = usual
         elif seconds > 0:
             self.velocity = moved / seconds

@@ -24,7 +24,8 @@ WAY = np.column_stack((0.4 * np.arange(20), np.zeros(20), np.zeros(20)))
 
 def began_anew(wheels, k):
     """Return poses (n, 3) of which those from number k on begin at the origin."""
-    later = se2.compose(np.broadcast_to(se2.inverse(wheels[k][None]), wheels[k:].shape), wheels[k:])
+    back = np.broadcast_to(se2.inverse(wheels[k][None]), wheels[k:].shape)
+    later = se2.compose(back, wheels[k:])
     return np.concatenate((wheels[:k], later))
 
 
