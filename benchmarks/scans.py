@@ -42,7 +42,7 @@ from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, align
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
 from l1slam_ros.core.scans.front_end import ScanFrontEnd
-from l1slam_ros.core.scans.grid import draw
+from l1slam_ros.core.scans.occupancy.grid import draw
 from l1slam_ros.core.scans.points import Points
 from l1slam_ros.io.scans.carmen import read_carmen
 from l1slam_ros.io.scans.to_graph import ScanMap, map_scans

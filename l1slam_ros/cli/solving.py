@@ -165,7 +165,7 @@ def _write(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
 
 
 def _write_grid(path: Path, made: 'ScanMap', outcome: Outcome) -> None:
-    from l1slam_ros.core.scans.grid import draw
+    from l1slam_ros.core.scans.occupancy.grid import draw
     from l1slam_ros.io.scans.grid_file import write_grid
 
     write_grid(path, draw(made.points, outcome.solution.poses))

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.scans.grid import Grid
+from l1slam_ros.core.scans.occupancy.grid import Grid
 from l1slam_ros.io.files import replacing, require_file, write_lines
 from l1slam_ros.io.ours import MARK, marked, refuse_others
 

@@ -21,7 +21,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.scans.live_grid import LiveGrid
+from l1slam_ros.core.scans.occupancy.live_grid import LiveGrid
 from l1slam_ros.core.scans.points import Points
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.scans.grid_file import write_grid

@@ -66,7 +66,7 @@ from rooms import laps, write_log
 from l1slam_ros.core import scans
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.kernels import ordering
-from l1slam_ros.core.scans import grid
+from l1slam_ros.core.scans.occupancy import grid
 from l1slam_ros.io.scans.reading import read_scans
 
 for k in (1, 2):

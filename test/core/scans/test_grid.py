@@ -15,7 +15,7 @@ from PIL import Image
 from rooms import WALLS, along, scan_at
 from scipy.spatial import KDTree
 
-from l1slam_ros.core.scans.grid import Grid, draw
+from l1slam_ros.core.scans.occupancy.grid import Grid, draw
 from l1slam_ros.core.scans.points import Points, points_of
 from l1slam_ros.io.scans.grid_file import write_grid
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans import kernels
-from l1slam_ros.core.scans.grid import Grid, rays_of
+from l1slam_ros.core.scans.occupancy.grid import Grid, rays_of
 from l1slam_ros.core.scans.points import Points
 
 # Log odds that one ray adds, in eighths.
