@@ -21,7 +21,8 @@ import numpy as np
 from l1slam_ros.cli.commands import Ending, inputs, read, read_scan_map, warn
 from l1slam_ros.cli.reference import Truth, known_false, position_error, read_truth
 from l1slam_ros.core.errors import OptionError
-from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import part_labels
 from l1slam_ros.core.memory import free, in_gigabytes, measure_by
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
@@ -135,7 +136,7 @@ def _with_parts_doubted(graph: FactorGraph, outcome: Outcome) -> Outcome:
     judgement = outcome.judgement
     if judgement is None or outcome.parts == 1:
         return outcome
-    part = component_labels(graph.subset(judgement.accepted))
+    part = part_labels(graph.subset(judgement.accepted))
     doubts = *judgement.doubts, doubt_of_parts(graph.between, part)
     return replace(outcome, judgement=replace(judgement, doubts=doubts))
 

@@ -59,6 +59,11 @@ def vague_odometry(graph: FactorGraph) -> Mask:
     return odometry & (size < np.median(size[odometry]) - vague if odometry.any() else False)
 
 
+def part_labels(graph: FactorGraph) -> Indices:
+    """Return the number of the part of each keyframe, (n,): vague odometry joins none."""
+    return component_labels(graph.subset(~vague_odometry(graph)))
+
+
 def bridged(graph: FactorGraph) -> FactorGraph:
     """Return the graph with a factor for each gap of its odometry, behind all others."""
     gaps = odometry_gaps(graph)

@@ -23,7 +23,7 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
-from l1slam_ros.core.graph.parts import bridged, odometry_gaps
+from l1slam_ros.core.graph.parts import bridged, odometry_gaps, part_labels
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch import OnRound, RobustMap, minimise_robustly
@@ -146,9 +146,10 @@ def solve(
         raise GraphError('the cost leaves double precision: measurements and information of the '
                          'graph are too large, or too different from each other')
     judgement = robust.judgement.of_all(whole) if robust else None
+    labels = part_labels if robust else component_labels
     offset = shared_offset(whole, solution.poses, judgement) if judgement else None
     return Outcome(solution, minimiser.solver, minimiser.reason, cost(initial), seed_cost, seconds,
-                   judgement, unjudged, int(component_labels(graph).max()) + 1, offset)
+                   judgement, unjudged, int(labels(graph).max()) + 1, offset)
 
 
 def _seed(graph: FactorGraph, method: Method) -> Array:

@@ -108,6 +108,18 @@ def test_two_sessions_are_joined_by_loops_or_stay_two_parts(world, joined):
         assert position_error(outcome.solution.poses[half], world.truth[half]) < 0.5
 
 
+@pytest.mark.parametrize('joined', [True, False])
+def test_a_step_that_says_next_to_nothing_joins_no_parts(world, joined):
+    factors, seam = world.graph.between, 199
+    low, high = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
+    step = factors.is_odometry & (low == seam)
+    keep = step | (low > seam) | (high <= seam) | joined
+    vague = retold(world.graph, times=np.where(step, 1000.0, 1.0)).subset(keep)
+    outcome = solve_graph(vague, None, SolveOptions())
+    assert outcome.parts == (1 if joined else 2)
+    assert solve_graph(vague, None, SolveOptions(robust=False)).parts == 1
+
+
 def ring(seed, n=600, loops=20):
     """Return a lap that loops of one place close, and how many steps it has."""
     angle = 2 * np.pi * np.arange(n + loops) / n
