@@ -111,12 +111,9 @@ class _Iterate:
 
     def advance(self, direction: '_Direction', primal: float) -> None:
         """Go along a direction, u and v so far; the slacks stay positive."""
-        dual = direction.dual
-        self.u = self.u + primal * direction.u
-        self.v = self.v + primal * direction.v
-        self.y = self.y + dual * direction.y
-        self.s = np.maximum(self.s - dual * direction.y, _SMALLEST_SLACK)
-        self.t = np.maximum(self.t + dual * direction.y, _SMALLEST_SLACK)
+        self.u, self.v, self.s, self.t, self.y = kernels.interior_point.advance(
+            self.u, self.v, self.s, self.t, self.y, direction.u, direction.v, direction.y,
+            primal, direction.dual, _SMALLEST_SLACK)
 
     def check_termination(self, cost: float, tolerance: float) -> bool:
         """Tell whether |e - u + v|_1 and u's + v't are below a part of the cost."""
@@ -309,9 +306,8 @@ def _centrality_corrector_rhs(direction: _Direction, rhs: _Products, mu: float) 
 def _solve_kkt(at: _Iterate, cholesky: BlockCholesky, Q: Array, rhs: _Products) -> _Direction:
     """Solve for the step whose complementarity products become `rhs` to first order."""
     c1, c2 = rhs
-    # e - (u - v) - (c1/s - u) + (c2/t - v)
-    g = at.residual - c1 / at.s + c2 / at.t
-    x = cholesky.solve(-at.system.transposed_times(at.y + Q * g))
+    g, pull = kernels.interior_point.aim(at.residual, at.y, at.s, at.t, Q, c1, c2)
+    x = cholesky.solve(-at.system.transposed_times(pull))
     moved = at.system.times(x)
     y, u, v, primal, dual, gap = kernels.interior_point.complete(
         *at.bounded, Q, c1, c2, g, moved, _FRACTION)

@@ -143,6 +143,9 @@ def test_the_step_solves_the_newton_equations(rows, rng):
     e, (u, v, s, t), y, q, c1, c2 = rows
     moved = rng.standard_normal(50)
     g = e - (u - v) - (c1 / s - u) + (c2 / t - v)
+    found, pull = kernels.aim(e, y, s, t, q, c1, c2)
+    assert_allclose(found, g)
+    assert_allclose(pull, y + q * g)
     dy, du, dv, primal, dual, _ = kernels.complete(u, v, s, t, q, c1, c2, g, moved, 1.0)
     assert_allclose(u * s + s * du - u * dy, c1)
     assert_allclose(v * t + t * dv + v * dy, c2)
