@@ -18,6 +18,21 @@ import numpy as np
 from l1slam_ros.core.kernels.compiled import loop
 
 
+@loop('(f8[::1], f8)')
+def begin(e, mu):
+    """Return u, v, s, t, y with e = u - v, u s = v t = mu, s = 1 - y and t = 1 + y."""
+    new = (np.empty_like(e), np.empty_like(e), np.empty_like(e), np.empty_like(e),
+           np.empty_like(e))
+    u, v, s, t, y = new
+    for k in range(len(e)):
+        root = np.hypot(mu, e[k])
+        large = (mu + root + abs(e[k])) / 2
+        small = mu * (mu + root) / (2 * large)  # (mu + root - |e|) / 2 would cancel
+        u[k], v[k] = (large, small) if e[k] >= 0 else (small, large)
+        s[k], t[k], y[k] = mu / u[k], mu / v[k], e[k] / (mu + root)
+    return new
+
+
 @loop('(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])')
 def aim(e, y, s, t, q, c1, c2):
     """Return g = e - (u - v) - (c1/s - u) + (c2/t - v), and y + q g."""

@@ -223,12 +223,7 @@ def _start(problem: L1Problem, poses: Array) -> _Iterate:
     """Return the point of the central path of mu = mean |e| for the residual as it is."""
     e = problem.residual(poses)
     system = problem.linearise(poses, e)
-    mu = smoothing(e)
-    root = np.hypot(mu, e)
-    large = (mu + root + np.abs(e)) / 2
-    small = mu * (mu + root) / (2 * large)  # (mu + root - |e|) / 2 would cancel
-    u, v = np.where(e >= 0, large, small), np.where(e >= 0, small, large)
-    return _Iterate(poses, system, u, v, mu / u, mu / v, e / (mu + root))
+    return _Iterate(poses, system, *kernels.interior_point.begin(e, smoothing(e)))
 
 
 def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: Curvature) -> bool:
