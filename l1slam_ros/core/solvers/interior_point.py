@@ -250,7 +250,7 @@ def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: 
         combined = max(combined, centring, key=lambda step: step.reach)
     if not np.isfinite(combined.x).all():
         return False
-    primal, at.poses, residual = _line_search(problem, at, combined)
+    primal, at.poses, residual = _line_search(problem, at, combined, _DEPARTURE * gap)
     at.system = problem.linearise(at.poses, residual)
     at.advance(combined, primal)
     return True
@@ -309,16 +309,15 @@ def _solve_kkt(at: _Iterate, cholesky: BlockCholesky, Q: Array, rhs: _Products) 
     return _Direction(x, moved, y, u, v, primal, dual, gap)
 
 
-def _line_search(problem: L1Problem, at: _Iterate,
-                 direction: _Direction) -> tuple[float, Array, Array]:
+def _line_search(problem: L1Problem, at: _Iterate, direction: _Direction,
+                 allowed: float) -> tuple[float, Array, Array]:
     """
-    Halve the primal step while the residual departs too far from its linearisation.
+    Halve the primal step while the residual departs further from its linearisation than allowed.
 
     Each pose moves by itself, until such a step is refused for once: to second order that tears a
     long way. From then on poses may move along the way as well, whichever costs less.
     """
     length = direction.primal
-    allowed = _DEPARTURE * at.gap
     while True:
         linear = at.residual + length * direction.residual
         best = np.inf
