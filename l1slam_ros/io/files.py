@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 
@@ -38,7 +39,7 @@ LAST_STAMP = 2**31 * NANOSECONDS - 1
 LARGEST = 1e30
 # Largest number of characters of a file that are quoted in an error.
 _QUOTED = 40
-# Number of lines that are formatted at once.
+# Number of lines that are formatted, or written, at once.
 _AT_ONCE = 500
 
 
@@ -138,7 +139,9 @@ def other_kind(path: str | os.PathLike[str]) -> str:
 def put_lines(path: Path, lines: Iterable[str]) -> None:
     """Write lines to a file, add a newline to each, and flush the file to the disk."""
     with path.open('w', encoding='utf-8') as file:
-        file.writelines(f'{line}\n' for line in lines)
+        left = iter(lines)
+        while many := list(islice(left, _AT_ONCE)):
+            file.write('\n'.join([*many, '']))
         file.flush()
         # Without this, a power cut just after the file is renamed could leave it empty.
         os.fsync(file.fileno())

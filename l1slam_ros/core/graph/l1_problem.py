@@ -72,8 +72,8 @@ class GraphProblem:
         manifold, factors = self.graph.manifold, self.graph.between
         k = manifold.TANGENT_SIZE
         # That of the residual before it is whitened: L y.
-        roots = np.ascontiguousarray(factors.sqrt_information.transpose(0, 2, 1))
-        dual = kernels.blocks.whiten(roots, dual.reshape(-1, k), (0,) * k)
+        dual = kernels.blocks.unwhiten_dual(
+            factors.sqrt_information, dual.reshape(-1, k), (0,) * k)
         return manifold.residual_curvature(factors.measurement, *ends(self.graph, poses), dual)
 
 

@@ -59,6 +59,20 @@ def whiten(roots, vectors, size):
     return product
 
 
+@for_sizes('f8[:, :, ::1], f8[:, ::1]')
+def unwhiten_dual(roots, duals, size):
+    """Return L y for each factor, (m, k); roots : (m, k, k) L'."""
+    k = len(size)
+    product = np.empty((len(roots), k))
+    for f in range(len(roots)):
+        for r in range(k):
+            total = 0.0
+            for c in range(k):
+                total += roots[f, c, r] * duals[f, c]
+            product[f, r] = total
+    return product
+
+
 @for_sizes('f8[:, :, ::1], f8[:, :, :, ::1]')
 def whiten_blocks(roots, blocks, size):
     """Turn J_i and J_j of each factor into L'J_i and L'J_j, (m, 2, k, k); roots : (m, k, k)."""

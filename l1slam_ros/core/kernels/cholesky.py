@@ -28,51 +28,97 @@ from l1slam_ros.core.kernels.compiled import ANY_SIZE, compiled, for_sizes
 
 # A pivot that is left with less than this part of its diagonal entry is rounding.
 _SINGULAR = 1e-13
+# Factors whose blocks are fetched at the same time.
+_AHEAD = 16
 
 
 _PANELS = 'f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1]'
-_FACTORS = ('f8[::1], i8[:, ::1], i8[:, ::1], b1[::1], i8[::1], i8[::1], f8[:, :, :, ::1], '
+_FACTORS = ('f8[::1], i8[:, ::1], i8[::1], i8[::1], b1[::1], i8[::1], i8[::1], f8[:, :, :, ::1], '
             'f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8')
 
 
 @for_sizes(_FACTORS, ANY_SIZE)
-def assemble(panels, address, width, turned, corner, stride, blocks, weights, diagonal, curvature,
-             share, size):
+def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, weights, diagonal,
+             curvature, share, size):
     """
     Write the lower triangle of J'WJ + diag(diagonal) + share C to the panels.
 
-    blocks : (m, 2, k, k) J_i and J_j; weights : (m, k); diagonal : (n, k)
+    keyframe : (m, 2), blocks : (m, 2, k, k), see `LinearSystem`; weights : (m, k); diagonal :
+    (n, k)
     curvature : (m', 2 k, 2 k) of the first m' factors, C is their sum
-    address, width : (m, 3) where the blocks (i, i), (j, j) and the one between i and j lie, and
-    the stride of their panels; address -1: there is none
-    turned : (m,) bool, the block between them is that of row i and column j
+    address, width : (m,) where the block between the keyframes i and j of each factor lies, and
+    the stride of its panel; address -1: there is none
+    turned : (m,) bool, that block is the one of row i and column j
     corner, stride : (n,) where each keyframe's own block begins, and its panel's stride
+
+    Returns the sum of what it read ahead, which is of no use.
     """
     k = len(size)
     for at in range(len(panels)):
         panels[at] = 0.0
-    for v in range(len(diagonal)):
-        for a in range(k):
-            panels[corner[v] + a * (stride[v] + 1)] = diagonal[v, a]
-    scaled = np.empty((2, k, k))
+    # Keyframes' own blocks are summed up side by side: in the panels they lie far apart, and each
+    # factor would wait for two of them.
+    own = _own_blocks(diagonal)
+    scaled, seen = np.empty((2, k, k)), 0.0
     for f in range(len(blocks)):
+        if f % _AHEAD == 0:
+            seen += _read_ahead(panels, address[f:f + _AHEAD], width[f:f + _AHEAD], k)
+        bent = f < len(curvature)
         for side in range(2):
             for r in range(k):
                 for c in range(k):
                     scaled[side, r, c] = weights[f, r] * blocks[f, side, r, c]
-        for part in range(3):
-            if address[f, part] < 0:
-                continue
-            left = part if part < 2 else (0 if turned[f] else 1)
-            right = part if part < 2 else 1 - left
             for r in range(k):
-                for c in range(r + 1 if part < 2 else k):
+                for c in range(r + 1):
                     total = 0.0
                     for a in range(k):
-                        total += blocks[f, left, a, r] * scaled[right, a, c]
-                    if f < len(curvature):
-                        total += share * curvature[f, left * k + r, right * k + c]
-                    panels[address[f, part] + r * width[f, part] + c] += total
+                        total += blocks[f, side, a, r] * scaled[side, a, c]
+                    if bent:
+                        total += share * curvature[f, side * k + r, side * k + c]
+                    own[keyframe[f, side], r, c] += total
+        if address[f] < 0:
+            continue
+        left = 0 if turned[f] else 1
+        right = 1 - left
+        for r in range(k):
+            for c in range(k):
+                total = 0.0
+                for a in range(k):
+                    total += blocks[f, left, a, r] * scaled[right, a, c]
+                if bent:
+                    total += share * curvature[f, left * k + r, right * k + c]
+                panels[address[f] + r * width[f] + c] += total
+    for v in range(len(corner)):
+        for r in range(k):
+            for c in range(r + 1):
+                panels[corner[v] + r * stride[v] + c] = own[v, r, c]
+    return seen
+
+
+@compiled
+def _own_blocks(diagonal):
+    """Return a block for each keyframe, with this diagonal, and one for what is held fixed."""
+    n, k = diagonal.shape
+    own = np.zeros((n + 1, k, k))
+    for v in range(n):
+        for a in range(k):
+            own[v, a, a] = diagonal[v, a]
+    return own
+
+
+@compiled
+def _read_ahead(panels, address, width, k):
+    """
+    Return the sum of a number of each row of some blocks.
+
+    They lie anywhere in memory. Read one right after the other, they are fetched at the same time;
+    and a sum that is returned is not left out by the compiler.
+    """
+    seen = 0.0
+    for f in range(len(address)):
+        for r in range(k):
+            seen += panels[max(address[f], 0) + r * width[f]]
+    return seen
 
 
 @for_sizes(_PANELS + ', i4[::1], i1[::1], i8, i4[:, ::1], i8[::1]', ANY_SIZE)

@@ -255,7 +255,7 @@ def block_addresses(keyframe, position, first, start, pattern, offset, stride, k
 
     Returns
     -------
-    address, width, turned : of the three blocks of each factor, (m, 3), (m, 3) and (m,), see
+    address, width, turned : of the block between the keyframes of each factor, (m,) each, see
         `cholesky.assemble`
     corner, own : where each keyframe's own block begins and its panel's stride, (n,)
 
@@ -271,15 +271,9 @@ def block_addresses(keyframe, position, first, start, pattern, offset, stride, k
         s = owner[column]
         own[v] = stride[s]
         corner[v] = offset[s] + (column - first[s]) * k * (own[v] + 1)
-    address, width = np.empty((m, 3), np.int64), np.empty((m, 3), np.int64)
-    turned = np.empty(m, np.bool_)
+    address, width = np.full(m, -1), np.zeros(m, np.int64)
+    turned = np.zeros(m, np.bool_)
     for f in range(m):
-        turned[f], width[f, 2], address[f, 2] = False, 0, -1
-        for side in range(2):
-            v = keyframe[f, side]
-            address[f, side], width[f, side] = -1, 0
-            if v < n:
-                address[f, side], width[f, side] = corner[v], own[v]
         i, j = keyframe[f, 0], keyframe[f, 1]
         if i < n and j < n:
             turned[f] = position[i] > position[j]
@@ -292,7 +286,7 @@ def block_addresses(keyframe, position, first, start, pattern, offset, stride, k
                     low = middle + 1
                 else:
                     high = middle
-            width[f, 2] = own[v]
-            address[f, 2] = (offset[s] + (low - start[s]) * k * own[v]
-                             + (position[v] - first[s]) * k)
+            width[f] = own[v]
+            address[f] = (offset[s] + (low - start[s]) * k * own[v]
+                          + (position[v] - first[s]) * k)
     return address, width, turned, corner, own

@@ -235,7 +235,7 @@ class BlockCholesky:
         if len(self._loose):
             own = system.diagonal(weights).reshape(-1, k)[self._loose]
             added[self._loose] += np.where(own > 0, _LOOSE * own, 1.0)
-        kernels.cholesky.assemble(layout.panels, *layout.places, system.blocks,
+        kernels.cholesky.assemble(layout.panels, self._keyframe, *layout.places, system.blocks,
                                   weights.reshape(-1, k), added, curvature, share, layout.size)
         self._factored = layout
         return self._factorise(layout) == system.size

@@ -111,12 +111,9 @@ class _Iterate:
 
     def advance(self, direction: '_Direction', primal: float) -> None:
         """Go along a direction, u and v so far; the slacks stay positive."""
-        dual = direction.dual
-        self.u = self.u + primal * direction.u
-        self.v = self.v + primal * direction.v
-        self.y = self.y + dual * direction.y
-        self.s = np.maximum(self.s - dual * direction.y, _SMALLEST_SLACK)
-        self.t = np.maximum(self.t + dual * direction.y, _SMALLEST_SLACK)
+        self.u, self.v, self.s, self.t, self.y = kernels.interior_point.advance(
+            self.u, self.v, self.s, self.t, self.y, direction.u, direction.v, direction.y,
+            primal, direction.dual, _SMALLEST_SLACK)
 
     def check_termination(self, cost: float, tolerance: float) -> bool:
         """Tell whether |e - u + v|_1 and u's + v't are below a part of the cost."""
@@ -226,12 +223,7 @@ def _start(problem: L1Problem, poses: Array) -> _Iterate:
     """Return the point of the central path of mu = mean |e| for the residual as it is."""
     e = problem.residual(poses)
     system = problem.linearise(poses, e)
-    mu = smoothing(e)
-    root = np.hypot(mu, e)
-    large = (mu + root + np.abs(e)) / 2
-    small = mu * (mu + root) / (2 * large)  # (mu + root - |e|) / 2 would cancel
-    u, v = np.where(e >= 0, large, small), np.where(e >= 0, small, large)
-    return _Iterate(poses, system, u, v, mu / u, mu / v, e / (mu + root))
+    return _Iterate(poses, system, *kernels.interior_point.begin(e, smoothing(e)))
 
 
 def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: Curvature) -> bool:
@@ -258,7 +250,7 @@ def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: 
         combined = max(combined, centring, key=lambda step: step.reach)
     if not np.isfinite(combined.x).all():
         return False
-    primal, at.poses, residual = _line_search(problem, at, combined)
+    primal, at.poses, residual = _line_search(problem, at, combined, _DEPARTURE * gap)
     at.system = problem.linearise(at.poses, residual)
     at.advance(combined, primal)
     return True
@@ -309,25 +301,23 @@ def _centrality_corrector_rhs(direction: _Direction, rhs: _Products, mu: float) 
 def _solve_kkt(at: _Iterate, cholesky: BlockCholesky, Q: Array, rhs: _Products) -> _Direction:
     """Solve for the step whose complementarity products become `rhs` to first order."""
     c1, c2 = rhs
-    # e - (u - v) - (c1/s - u) + (c2/t - v)
-    g = at.residual - c1 / at.s + c2 / at.t
-    x = cholesky.solve(-at.system.transposed_times(at.y + Q * g))
+    g, pull = kernels.interior_point.aim(at.residual, at.y, at.s, at.t, Q, c1, c2)
+    x = cholesky.solve(-at.system.transposed_times(pull))
     moved = at.system.times(x)
     y, u, v, primal, dual, gap = kernels.interior_point.complete(
         *at.bounded, Q, c1, c2, g, moved, _FRACTION)
     return _Direction(x, moved, y, u, v, primal, dual, gap)
 
 
-def _line_search(problem: L1Problem, at: _Iterate,
-                 direction: _Direction) -> tuple[float, Array, Array]:
+def _line_search(problem: L1Problem, at: _Iterate, direction: _Direction,
+                 allowed: float) -> tuple[float, Array, Array]:
     """
-    Halve the primal step while the residual departs too far from its linearisation.
+    Halve the primal step while the residual departs further from its linearisation than allowed.
 
     Each pose moves by itself, until such a step is refused for once: to second order that tears a
     long way. From then on poses may move along the way as well, whichever costs less.
     """
     length = direction.primal
-    allowed = _DEPARTURE * at.gap
     while True:
         linear = at.residual + length * direction.residual
         best = np.inf

@@ -22,7 +22,7 @@ Source: Martinec and Pajdla, "Robust rotation and translation estimation" (2007)
 relaxation; Chatterjee and Govindu, "Efficient and robust large-scale rotation averaging" (2013)
 for the repeated L1 problem.
 
-A large graph that is clean needs none of it (`first_poses`): its L2 map, to which the relaxation
+A large graph that is clean needs none of it (`first_poses`): the L2 map, to which the relaxation
 leads, is a start as good, and the exact solver goes there first anyway.
 """
 
@@ -47,7 +47,7 @@ from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.gauss_newton import FITS, ROUGH_L2, linear_step, minimise_l2, spare
 from l1slam_ros.core.solvers.interior_point import interior_point
-from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions
 from l1slam_ros.core.solvers.restarted_pdhg import minimise_l1_halpern
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
@@ -62,11 +62,11 @@ _NEAR = 1.5
 _SAME = 1e-6
 # From so many rows on a seed takes seconds. Below, where graphs start is as it ever was.
 _MANY_ROWS = 100_000
-# A clean graph: its L2 map fits to within the noise (see `gauss_newton.l2_optimum`), and no
-# residual is larger than so many times their root mean square. Of normal noise the largest of ten
-# million is 5.5; of lies that are few among many loops one is 16 or more. And rotations are off
-# [rad] by no more in the mean square: beyond twice that, L1 often has another optimum nearby, and
-# which of both is better is a matter of luck.
+# A clean graph: a map near that of L2 fits to within the noise (see `gauss_newton.l2_optimum`),
+# and no residual is larger than so many times their root mean square. Of normal noise the largest
+# of ten million is 5.5; of lies that are few among many loops one is 16 or more. And rotations are
+# off [rad] by no more in the mean square: beyond twice that, L1 often has another optimum nearby,
+# and which of both is better is a matter of luck.
 _LARGEST, _TURNED = 8.0, 0.1
 
 
@@ -103,7 +103,7 @@ def seed_poses(graph: FactorGraph, cholesky: BlockCholesky | None,
 def first_poses(graph: FactorGraph, cholesky: BlockCholesky,
                 check: Callable[[], None] = lambda: None) -> Array:
     """
-    Return poses to start from, (n, p): of a large clean graph the L2 map, else Algorithm 3's.
+    Return poses to start from, (n, p): Algorithm 3's, or near the L2 map of a large clean graph.
 
     Arguments as those of `seed_poses`.
     """
@@ -118,21 +118,27 @@ def first_poses(graph: FactorGraph, cholesky: BlockCholesky,
 
 def _clean_map(graph: FactorGraph, chordal: Array, cholesky: BlockCholesky,
                check: Callable[[], None]) -> Array | None:
+    """Return poses (n, p) near the L2 map, by `chordal_poses`; None: the graph is not clean."""
+    check()
+    poses = linear_step(graph, placed(graph, chordal), cholesky, graph.manifold.TRANSLATION)
+    if not _is_clean(graph, poses):
+        poses = minimise_l2(graph, poses, ROUGH_L2, cholesky, lambda *_: check()).poses
+    return poses if _is_clean(graph, poses) else None
+
+
+def _is_clean(graph: FactorGraph, poses: Array) -> bool:
     """
-    Return the L2 map (n, p) that `chordal_poses` lead to; None: it is not a clean one.
+    Tell whether all factors agree on poses (n, p) to within the noise.
 
     Where rotations end a turn off, or loops lie, some residuals are out of all proportion.
     """
-    check()
-    poses = linear_step(graph, placed(graph, chordal), cholesky, graph.manifold.TRANSLATION)
-    found = minimise_l2(graph, poses, ROUGH_L2, cholesky, lambda *_: check())
-    whitened = whitened_residual(graph, found.poses)
-    largest = _LARGEST * np.sqrt(found.cost / len(whitened))
-    turns = graph.manifold.residual(graph.between.measurement, *ends(graph, found.poses))[
+    whitened = whitened_residual(graph, poses)
+    chi2 = l2_cost(whitened)
+    turns = graph.manifold.residual(graph.between.measurement, *ends(graph, poses))[
         :, graph.manifold.ROTATION]
-    is_clean = (found.cost <= FITS * spare(graph) and np.abs(whitened).max() <= largest
+    return bool(chi2 <= FITS * spare(graph)
+                and np.abs(whitened).max() <= _LARGEST * np.sqrt(chi2 / len(whitened))
                 and (turns**2).mean() <= _TURNED**2)
-    return found.poses if is_clean else None
 
 
 def _references(graph: FactorGraph, cholesky: BlockCholesky | None,
@@ -170,11 +176,13 @@ def chordal_poses(graph: FactorGraph, cholesky: BlockCholesky) -> Array | None:
     if not cholesky.factorise(system, np.repeat(weights, k)):
         return None
     # What is held fixed has R = I.
-    known = -(blocks * (keyframe == size)[:, :, None, None]).sum(axis=1)
+    held = (keyframe == size).any(axis=1)
+    at, part_of = keyframe[held], blocks[held]
+    known = -(part_of * (at == size)[:, :, None, None]).sum(axis=1)
     right = np.zeros((size + 1, k, k))
     for side in range(2):
-        np.add.at(right, keyframe[:, side], weights[:, None, None]
-                  * (np.swapaxes(blocks[:, side], 1, 2) @ known))
+        np.add.at(right, at[:, side], weights[held, None, None]
+                  * (np.swapaxes(part_of[:, side], 1, 2) @ known))
     R = np.tile(np.eye(k), (graph.n_poses, 1, 1))
     for row in range(k):
         R[fixed:, row] = cholesky.solve(right[:size, :, row].ravel()).reshape(size, k)

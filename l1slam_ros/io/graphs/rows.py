@@ -9,7 +9,6 @@
 """The lines of a graph file as arrays; errors name the malformed line."""
 
 import os
-from collections import defaultdict
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -88,12 +87,16 @@ class GraphLines:
 def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
     """Read a graph file; return its lines by their tags."""
     lines, left_out = restored(read_lines(path))
-    groups: dict[str, TextLines] = defaultdict(lambda: TextLines([], []))
+    groups: dict[str, TextLines] = {}
     for number, text in zip(lines.numbers, lines.texts, strict=True):
-        tag, *rest = text.split(None, 1)
-        group = groups[tag]
+        tag, _, rest = text.partition(' ')
+        if (group := groups.get(tag)) is None:
+            # A new tag, or other whitespace beside it.
+            tag, *behind = text.split(None, 1)
+            rest = ''.join(behind)
+            group = groups.setdefault(tag, TextLines([], []))
         group.numbers.append(number)
-        group.texts.append(rest[0] if rest else '')
+        group.texts.append(rest.lstrip())
     if not groups:
         raise FileError(path, f'the file is empty; expected {expected_tags("between")} lines')
     known = TAGS.keys() | TAGS_LEFT_OUT.keys() | {'FIX'}

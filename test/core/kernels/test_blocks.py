@@ -69,6 +69,8 @@ def test_vectors_and_jacobians_are_whitened(k, rng):
     e = rng.standard_normal((7, k))
     assert_allclose(kernels.whiten(roots, e, (0,) * k), np.einsum('frc,fc->fr', roots, e),
                     atol=1e-12)
+    assert_allclose(kernels.unwhiten_dual(roots, e, (0,) * k),
+                    np.einsum('fcr,fc->fr', roots, e), atol=1e-12)
     blocks = J.copy()
     kernels.whiten_blocks(roots, blocks, (0,) * k)
     assert_allclose(blocks, roots[:, None] @ J, atol=1e-12)

@@ -138,11 +138,24 @@ def rows(rng):
     return e, (u, v, s, t), y, 1 / (u / s + v / t), c1, c2
 
 
+@pytest.mark.parametrize('size', [1e-3, 1.0, 1e12])
+def test_a_run_begins_on_the_central_path(size, rng):
+    e = np.append(size * rng.standard_normal(50), 0.0)
+    u, v, s, t, y = kernels.begin(e, 0.3)
+    assert_allclose(u - v, e, atol=1e-15)
+    assert_allclose((u * s, v * t), np.full((2, 51), 0.3))
+    assert_allclose((s, t), (1 - y, 1 + y), atol=1e-15)
+    assert min(u.min(), v.min(), s.min(), t.min()) > 0
+
+
 def test_the_step_solves_the_newton_equations(rows, rng):
     """u s = c1 and v t = c2 to first order, e + J dx = u - v, and bounds met as said."""
     e, (u, v, s, t), y, q, c1, c2 = rows
     moved = rng.standard_normal(50)
     g = e - (u - v) - (c1 / s - u) + (c2 / t - v)
+    found, pull = kernels.aim(e, y, s, t, q, c1, c2)
+    assert_allclose(found, g)
+    assert_allclose(pull, y + q * g)
     dy, du, dv, primal, dual, _ = kernels.complete(u, v, s, t, q, c1, c2, g, moved, 1.0)
     assert_allclose(u * s + s * du - u * dy, c1)
     assert_allclose(v * t + t * dv + v * dy, c2)
