@@ -27,7 +27,7 @@ import numpy as np
 from l1slam_ros.core.bordered.front import Front
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, lowest_of_components
+from l1slam_ros.core.graph.factor_graph import BetweenFactors, lowest_of_components
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.running.map_to_odom import Newest
 
@@ -137,17 +137,14 @@ def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> d
 def _joined(robot: Indices, numbers: Indices, factors: BetweenFactors,
             accepted: Mask) -> tuple[Mask, int | None]:
     """Return which robots are joined to the first one, (r,), or the world: then None, else it."""
-    r = len(numbers)
-    # Of thousands of factors few join robots, and every update asks: small numbers take less time.
-    place = np.searchsorted(numbers, robot).astype(np.min_scalar_type(r))
-    i, j = factors.i[:len(accepted)], factors.j[:len(accepted)]
-    one, other = place[i], place[j]
-    rows = np.flatnonzero(accepted & ((one != other) | (i == WORLD)))
-    # The world comes after the robots.
-    one = np.where(i[rows] == WORLD, r, one[rows].astype(np.int64))
-    # Few pairs of robots.
-    pairs = np.flatnonzero(np.bincount(one * r + other[rows]))
-    one, other = np.divmod(pairs, r)
+    r, count = len(numbers), len(accepted)
+    # The world comes after the robots, and after their keyframes: -1 picks it.
+    place = np.append(np.searchsorted(numbers, robot), r)
+    # Every update asks, of thousands of factors: small numbers take less time. What is not
+    # accepted is counted as a loop of the first robot with itself, which joins nothing.
+    place = place.astype(np.min_scalar_type((r + 1) ** 2))
+    pair = (place[factors.i[:count]] * (r + 1) + place[factors.j[:count]]) * accepted
+    one, other = np.divmod(np.flatnonzero(np.bincount(pair, minlength=1)), r + 1)
     component = lowest_of_components(one, other, r + 1)
     if (one == r).any():
         return component[:-1] == component[-1], None
