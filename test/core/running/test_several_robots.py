@@ -101,7 +101,10 @@ def test_what_joins_robots_is_the_same_found_as_it_comes_and_found_anew(monkeypa
 
     monkeypatch.setattr(Joins, 'ends', both)
     team, backend = Team(n=180, edges=600, lies=60, robots=3), Backend(EVERY)
-    for robot, message in team.messages():
+    messages = team.messages()
+    for k, (robot, message) in enumerate(messages):
+        if k in (len(messages) // 10, len(messages) // 2):
+            backend.settle()
         if isinstance(message, OdometrySample):
             backend.add_odometry(message, robot)
             backend.update(0.0)
