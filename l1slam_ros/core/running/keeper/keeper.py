@@ -39,7 +39,7 @@ from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.core.running.keeper.schedule import Size
 from l1slam_ros.core.running.map_state import Carried, MapState
-from l1slam_ros.core.running.map_to_odom import MapToOdom, Newest
+from l1slam_ros.core.running.map_to_odom import MapToOdom, Newest, move_all
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.robot_maps import Joins, Seen, map_ends
 from l1slam_ros.core.running.snapshot import Robot, SavedMap, Snapshot
@@ -296,8 +296,8 @@ class Keeper:
 
     def _move(self, ends: Mapping[int, Newest]) -> None:
         """Note a changed map; ends : its last keyframe of each robot; the graph is locked."""
-        for robot, end in ends.items():
-            self._odom_of(robot).move(self._builder.robots[robot], end)
+        move_all([(self._odom_of(robot), self._builder.robots[robot], end)
+                  for robot, end in ends.items()])
         self._revisions = self._revisions.after(map=True)
 
     # What the workers make.
