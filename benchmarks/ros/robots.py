@@ -15,9 +15,10 @@ A simulated drive is fed to a back end as that of one robot, and cut into five w
 interleave. Five robots close more loops at the end of the drive than one does: a third back end
 gets as many of them, drawn, as one robot has. The last keyframes come one by one, to the three
 back ends by turns, each with its loops and an update. Printed are the median and the 99th
-percentile of an update, of the processor in its thread, and how the latter compares; then the
-median of these ratios over drives of several seeds. One drive says little: how long the ways in
-the elimination tree are differs by half from drive to drive, whoever drives it.
+percentile of an update, of the processor in its thread. At the end the 99th percentiles of all
+updates are compared, of drives of several seeds, and the ratios of each drive. One drive says
+little: its 99th percentile is that of five updates, and how long the ways in the elimination tree
+are differs by half from drive to drive, whoever drives it.
 
 Then two robots, each with half of the keyframes, that nothing joins yet: the loops between them
 come at once, and updates go on until all is in one map. Printed are the longest update, and after
@@ -116,8 +117,8 @@ def drives_of(keyframes: int, timed: int, seed: int) -> dict[str, Drive]:
     return {'one': one, 'five': five, 'five, as many loops': fewer}
 
 
-def updates(drives: dict[str, Drive], keyframes: int, timed: int) -> dict[str, float]:
-    """Print how long updates take while the last keyframes come; return each p99 [ms]."""
+def updates(drives: dict[str, Drive], keyframes: int, timed: int) -> dict[str, list[float]]:
+    """Print how long updates take while the last keyframes come; return how long each [s]."""
     begin = keyframes - timed
     seconds: dict[str, list[float]] = {name: [] for name in drives}
     with ExitStack() as stack:
@@ -135,27 +136,32 @@ def updates(drives: dict[str, Drive], keyframes: int, timed: int) -> dict[str, f
                 _come(drive, backend, at)
                 seconds[name].append(_updated(backend)[1])
             time.sleep(max(began + _PERIOD - time.monotonic(), 0.0))
-    found = {}
     for name, drive in drives.items():
-        median, found[name] = np.percentile(seconds[name][_WARM:], (50, 99)) * 1e3
+        del seconds[name][:_WARM]
+        median, most = np.percentile(seconds[name], (50, 99)) * 1e3
         loops = np.count_nonzero(drive.last >= begin + _WARM) / (timed - _WARM)
         print(f'  {name}: {loops:.2f} loops an update, {median:.2f} ms of the processor in the '
-              f'median, p99 {found[name]:.2f} ms', flush=True)
-    return found
+              f'median, p99 {most:.2f} ms', flush=True)
+    return seconds
 
 
 def ratios(keyframes: int, timed: int, seeds: int) -> None:
     """Print how the 99th percentiles of several robots compare with that of one."""
-    found: dict[str, list[float]] = {}
+    found: dict[str, list[list[float]]] = {}
     for seed in range(seeds):
         print(f'drive {seed}, {keyframes:,} keyframes in all', flush=True)
-        drives = drives_of(keyframes, timed, seed)
-        one, *others = updates(drives, keyframes, timed).items()
-        for name, p99 in others:
-            found.setdefault(name, []).append(p99 / one[1])
-    for name, of_drives in found.items():
-        print(f'p99 of {name}, over that of one: {statistics.median(of_drives):.2f} in the median '
-              f'of {seeds} drives, {min(of_drives):.2f} to {max(of_drives):.2f}', flush=True)
+        of_drive = updates(drives_of(keyframes, timed, seed), keyframes, timed)
+        for name, seconds in of_drive.items():
+            found.setdefault(name, []).append(seconds)
+    of_one = next(iter(found.values()))
+    for name, ours in found.items():
+        median, most = np.percentile(np.concatenate(ours), (50, 99)) * 1e3
+        over = most / (np.percentile(np.concatenate(of_one), 99) * 1e3)
+        of_drives = [float(np.percentile(own, 99) / np.percentile(other, 99))
+                     for own, other in zip(ours, of_one, strict=True)]
+        print(f'{name}, all {seeds} drives: median {median:.2f} ms, p99 {most:.2f} ms, {over:.2f} '
+              f'times that of one; of a drive {statistics.median(of_drives):.2f} times in the '
+              f'median, {min(of_drives):.2f} to {max(of_drives):.2f}', flush=True)
 
 
 def _come(drive: Drive, backend: Backend, at: int) -> None:
