@@ -18,8 +18,8 @@ ends with 1. All stays in the folder, and recordings that are there already are 
 code must not change meanwhile, as a batch is resumed by the version that began it alone.
 
 With `--pairs` nothing is killed: so many times all recordings are solved by two workers and by
-one, in turn. Printed are the times by the clock, their ratios, the median of these, and all
-processor time, which says how busy the machine was with other work.
+one, in turn. Printed are the times by the clock, their ratios and the median of these, and what
+they took of the processor.
 """
 
 import argparse
@@ -90,14 +90,16 @@ def whole(folder: Path, output: Path, workers: int) -> float:
     process = start(folder, output, '--workers', str(workers))
     said = process.communicate()[1]
     seconds, cpu = time.perf_counter() - began, _cpu_of_children() - cpu
-    print(f'{workers} worker(s): code {process.returncode}, {seconds:.1f} s, {cpu:.1f} s of the '
-          f'processor, load of the machine {os.getloadavg()[0]:.2f}; '
-          f'{said.strip().splitlines()[-1]}', flush=True)
+    solving = sum(line['cpu_seconds'] for line in lines(output))
+    print(f'{workers} worker(s): code {process.returncode}, {seconds:.1f} s; of the processor '
+          f'{solving:.1f} s for recordings, {cpu:.1f} s besides; load of the machine '
+          f'{os.getloadavg()[0]:.2f}; {said.strip().splitlines()[-1]}', flush=True)
     return seconds
 
 
 def _cpu_of_children() -> float:
-    """Return the processor time of all processes that this one started, and that ended [s]."""
+    """Return the processor time of what this process started, but for that of recordings [s]."""
+    # Who starts the processes that solve leaves their ends to the system, so they do not count.
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
