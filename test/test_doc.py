@@ -210,6 +210,34 @@ def test_a_command_in_a_sentence_has_options_that_there_are(command, capsys):
         assert option.replace('--no-', '--') in said, option
 
 
+# A figure: a number with its unit, or alone in the cell of a table.
+NUMBER = r'(?:\d[\d,]*(?:\.\d+)?|\.\d+)'
+FIGURE = re.compile(rf"""(?<![\w.`-]){NUMBER}\ ?(?:[mkµ]?s|[ckm]?m|min|rad|[kMG]i?B|k?Hz|%|times
+                         |seconds|bytes|messages)(?![\w`])|(?<=\|\ ){NUMBER}(?=\ \|)""", re.X)
+COMMAND = re.compile(r'^```sh|`(?:python|l1slam|make|\.venv/bin/\w+) [^`]+`', re.M)
+# Sections whose numbers nobody measured, and what they are.
+NOT_MEASURED = {
+    ('doubts.md', 'How loops are judged'): 'limits of the model',
+    ('troubleshooting.md', 'Unusual input'): 'limits of what is taken in',
+    ('your_recording.md', 'Where stamps come from'): 'stamps that are invented',
+}
+
+
+def sections(page):
+    """Return the headings of a page, each with the text up to the next one of any level."""
+    _, *parts = re.split(r'^#+ (.*)$', re.sub(
+        r'^```.*?^```$', lambda block: block[0].replace('#', ' '), page.read_text(),
+        flags=re.M | re.S), flags=re.M)
+    return list(zip(parts[::2], parts[1::2], strict=True))
+
+
+def test_every_section_with_figures_has_a_command():
+    left = {(page.name, heading) for page in PAGES for heading, text in sections(page)
+            if FIGURE.search(re.sub(r'^```.*?^```$', '', text, flags=re.M | re.S))
+            and not COMMAND.search(text)}
+    assert left == NOT_MEASURED.keys()
+
+
 def room(folder, package=ROOT):
     """Return a folder like a fresh checkout, beside its own outputs, and what it is run with."""
     for entry in ROOT.iterdir():

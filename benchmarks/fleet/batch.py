@@ -10,18 +10,26 @@
 `l1slam batch` over many small recordings, some of them hostile: results, kills, and what it costs.
 
     python benchmarks/fleet/batch.py [--recordings 1000] [--hostile 20] [--poses 300] [--kills 4]
-        [--folder DIR]
+        [--folder DIR] [--pairs 0]
 
 Every third recording is a bag, the others are g2o files. They are solved by two workers, by one,
-and by two while the command and its workers are killed; the tables must be the same bytes. All
-stays in the folder, and what is there already is not made again.
+and by two while the command and its workers are killed; the tables must be the same bytes, else it
+ends with 1. All stays in the folder, and recordings that are there already are not made again; the
+code must not change meanwhile, as a batch is resumed by the version that began it alone.
+
+With `--pairs` nothing is killed: so many times all recordings are solved by two workers and by
+one, in turn. Printed are the times by the clock, their ratios and the median of these, and what
+they took of the processor.
 """
 
 import argparse
 import csv
 import json
 import os
+import resource
+import shutil
 import signal
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -46,6 +54,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument('--hostile', type=int, default=20)
     parser.add_argument('--poses', type=int, default=300, help='of the largest recording')
     parser.add_argument('--kills', type=int, default=4, help='of the command, and of a worker')
+    parser.add_argument('--pairs', type=int, default=0, help='only time so many pairs of runs')
     parser.add_argument('--folder', type=Path, help='where to work (default: a temporary one)')
     return parser.parse_args()
 
@@ -77,13 +86,37 @@ def start(folder: Path, output: Path, *options: str) -> 'subprocess.Popen[str]':
 
 def whole(folder: Path, output: Path, workers: int) -> float:
     """Run it to its end; return how long it took [s]."""
-    began = time.perf_counter()
+    began, cpu = time.perf_counter(), _cpu_of_children()
     process = start(folder, output, '--workers', str(workers))
     said = process.communicate()[1]
-    seconds = time.perf_counter() - began
-    print(f'{workers} worker(s): code {process.returncode}, {seconds:.1f} s, load of the machine '
+    seconds, cpu = time.perf_counter() - began, _cpu_of_children() - cpu
+    solving = sum(line['cpu_seconds'] for line in lines(output))
+    print(f'{workers} worker(s): code {process.returncode}, {seconds:.1f} s; of the processor '
+          f'{solving:.1f} s for recordings, {cpu:.1f} s besides; load of the machine '
           f'{os.getloadavg()[0]:.2f}; {said.strip().splitlines()[-1]}', flush=True)
     return seconds
+
+
+def _cpu_of_children() -> float:
+    """Return the processor time of what this process started, but for that of recordings [s]."""
+    # Who starts the processes that solve leaves their ends to the system, so they do not count.
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def pairs(folder: Path, place: Path, count: int) -> None:
+    """Solve all with two workers and with one, in turn, so many times."""
+    ratios = []
+    for number in range(count):
+        seconds = {}
+        for workers in ((2, 1), (1, 2))[number % 2]:
+            output = place / f'pair{number}of{workers}'
+            seconds[workers] = whole(folder, output, workers)
+            shutil.rmtree(output)
+        ratios.append(seconds[2] / seconds[1])
+        print(f'pair {number}: two workers take {ratios[-1]:.2f} of the time of one', flush=True)
+    print(f'two workers take {statistics.median(ratios):.2f} of the time of one, in the median of '
+          f'{count} pairs, {min(ratios):.2f} to {max(ratios):.2f}')
 
 
 def killed(folder: Path, output: Path, kills: int, seconds: float) -> None:
@@ -98,8 +131,9 @@ def killed(folder: Path, output: Path, kills: int, seconds: float) -> None:
                 os.kill(int(line['worker'].rpartition(':')[2]), signal.SIGKILL)
             time.sleep(seconds / (kills + 1) / 2)
             process.kill()
+        said = process.communicate()[1].strip().splitlines()[-1:] if number == kills else []
         process.wait()
-        print(f'killed: code {process.returncode}, {len(lines(output)):,} done', flush=True)
+        print(f'killed: code {process.returncode}, {len(lines(output)):,} done', *said, flush=True)
 
 
 def lines(output: Path) -> list[dict[str, object]]:
@@ -109,17 +143,20 @@ def lines(output: Path) -> list[dict[str, object]]:
     return [line for line in map(json.loads, text) if 'recording' in line]
 
 
-def report(folder: Path, results: list[Path], seconds: list[float]) -> None:
-    """Print what came out, and what a recording costs."""
+def report(folder: Path, results: list[Path], seconds: list[float]) -> bool:
+    """Print what came out, and what a recording costs; return whether all runs are the same."""
     with open(results[0] / 'table.csv', newline='') as file:
         rows = list(csv.DictReader(file))
     failed = [row for row in rows if row['status'] == 'failed']
     print(f'{len(rows):,} recordings, {len(rows) - len(failed):,} maps, {len(failed)} sentences:')
     for row in failed:
         print(f'  {row["sentence"]}')
+    alike = []
     for name in ('table.csv', 'maps'):
-        same = all(content(output / name) == content(results[0] / name) for output in results)
-        print(f'{name}: {"the same bytes" if same else "NOT THE SAME"} in all {len(results)} runs')
+        alike.append(all(
+            content(output / name) == content(results[0] / name) for output in results))
+        print(f'{name}: {"the same bytes" if alike[-1] else "NOT THE SAME"} in all '
+              f'{len(results)} runs')
     twice = len(lines(results[-1])) - len({line['recording'] for line in lines(results[-1])})
     print(f'recordings done twice over the kills: {twice}')
     found = [line for line in lines(results[1]) if line['row']['status'] != 'failed']
@@ -133,6 +170,7 @@ def report(folder: Path, results: list[Path], seconds: list[float]) -> None:
                        ('log', results[0] / 'log.jsonl'), ('CSV', results[0] / 'table.csv'),
                        ('parquet', results[0] / 'table.parquet')):
         print(f'{name}: {size(path) / len(rows):,.0f} bytes a recording')
+    return all(alike) and not twice
 
 
 def content(path: Path) -> dict[str, bytes]:
@@ -147,18 +185,21 @@ def size(path: Path) -> int:
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
-def main() -> None:
+def main() -> int:
     """Run all of it."""
     arguments = parse()
     place = arguments.folder or Path(tempfile.mkdtemp(prefix='l1slam_fleet_'))
     folder = place / 'recordings'
     if not folder.exists():
         make(folder, arguments.recordings, arguments.hostile, arguments.poses)
+    if arguments.pairs:
+        pairs(folder, place, arguments.pairs)
+        return 0
     results = [place / f'results{k}' for k in range(3)]
     seconds = [whole(folder, results[k], 2 - k) for k in (0, 1)]
     killed(folder, results[2], arguments.kills, seconds[0])
-    report(folder, results, seconds)
+    return int(not report(folder, results, seconds))
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

@@ -9,20 +9,27 @@
 """
 What several robots in one back end cost.
 
-    python benchmarks/ros/robots.py [--keyframes 10000] [--timed 500]
+    python benchmarks/ros/robots.py [--keyframes 10000] [--timed 500] [--seeds 5]
 
 A simulated drive is fed to a back end as that of one robot, and cut into five whose keyframes
-interleave. The last keyframes come one by one, each with its loops and an update: printed are the
-median and the 99th percentile of an update, by the clock and of the processor in its thread, and
-how the latter compares. Five robots close more loops at the end of the drive than one does: it is
-compared with all of them, and with as many of them, drawn, as one robot has. Then two robots, each
-with half of the keyframes, that nothing joins yet: the loops between them come at once, and
-updates go on until all is in one map. Printed are the longest update, and after what time the
-second robot was in the map of the first. What goes on behind updates has the other core.
+interleave. Five robots close more loops at the end of the drive than one does: a third back end
+gets as many of them, drawn, as one robot has. The last keyframes come one by one, to the three
+back ends by turns, each with its loops and an update. Printed are the median and the 99th
+percentile of an update, of the processor in its thread. At the end the 99th percentiles of all
+updates are compared, of drives of several seeds, and the ratios of each drive. One drive says
+little: its 99th percentile is that of five updates, and how long the ways in the elimination tree
+are differs by half from drive to drive, whoever drives it.
+
+Then two robots, each with half of the keyframes, that nothing joins yet: the loops between them
+come at once, and updates go on until all is in one map. Printed are the longest update, and after
+what time the second robot was in the map of the first. What goes on behind updates has the other
+core.
 """
 
 import argparse
+import statistics
 import time
+from contextlib import ExitStack
 
 import numpy as np
 
@@ -32,7 +39,9 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.running.backend import Backend, BackendOptions
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
-KEYFRAMES, TIMED, ROBOTS = 10_000, 500, 5
+KEYFRAMES, TIMED, ROBOTS, SEEDS = 10_000, 500, 5, 5
+# Keyframes with an update that is not timed: the first ones link what is compiled.
+_WARM = 10
 # An update as often as the node makes one, and no budget: what goes on behind is not waited for.
 _PERIOD, _SECOND = 0.05, 10**9
 _UNKNOWN = np.zeros((6, 6))
@@ -48,9 +57,9 @@ _OPTIONS = BackendOptions.from_mapping({
 class Drive:
     """A simulated drive, cut into as many robots, each with odometry of its own."""
 
-    def __init__(self, keyframes: int, robots: int):
+    def __init__(self, keyframes: int, robots: int, seed: int = 0):
         world = simulate_world(keyframes, 5 * keyframes // 2, WorldOptions(
-            odometry_sigma_rotation=0.005), np.random.default_rng(0))
+            odometry_sigma_rotation=0.005), np.random.default_rng(seed))
         self.factors, self.part = world.graph.between, keyframes // robots
         self.robot = np.minimum(np.arange(keyframes) // self.part, robots - 1)
         self.pose3 = se2.to_pose3(odometry_poses(world.graph))
@@ -100,24 +109,66 @@ class Drive:
         return covariance
 
 
-def updates(drive: Drive, timed: int) -> float:
-    """Print how long updates take while the last keyframes come; return p99 of the processor."""
-    keyframes, robots, seconds = len(drive.order), int(drive.robot[-1]) + 1, []
-    with Backend(_OPTIONS) as backend:
-        for at in range(keyframes):
-            drive.add(backend, at)
-            for loop in drive.loops_of(at):
-                backend.add_loop(loop)
-            if at == keyframes - timed:
-                backend.settle()
-            elif at > keyframes - timed:
-                seconds.append(_update(backend))
-    clock, cpu = (np.percentile(column, (50, 99, 100)) * 1e3 for column in np.array(seconds).T)
-    loops = np.count_nonzero(drive.last > keyframes - timed) / (timed - 1)
-    print(f'{robots} robot{"s" * (robots > 1)}, {keyframes:,} keyframes in all, {loops:.2f} loops '
-          f'an update: it takes {clock[0]:.1f} ms in the median, p99 {clock[1]:.1f} ms, at most '
-          f'{clock[2]:.1f} ms; of the processor {cpu[0]:.1f}, p99 {cpu[1]:.1f} ms', flush=True)
-    return float(cpu[1])
+def drives_of(keyframes: int, timed: int, seed: int) -> dict[str, Drive]:
+    """Return a drive as that of one robot, of five, and of five with as many loops at the end."""
+    one, five, fewer = (Drive(keyframes, robots, seed) for robots in (1, ROBOTS, ROBOTS))
+    begin = keyframes - timed
+    fewer.thin(begin, int(np.count_nonzero(one.last >= begin)))
+    return {'one': one, 'five': five, 'five, as many loops': fewer}
+
+
+def updates(drives: dict[str, Drive], keyframes: int, timed: int) -> dict[str, list[float]]:
+    """Print how long updates take while the last keyframes come; return how long each [s]."""
+    begin = keyframes - timed
+    seconds: dict[str, list[float]] = {name: [] for name in drives}
+    with ExitStack() as stack:
+        driven = {name: (drive, stack.enter_context(Backend(_OPTIONS)))
+                  for name, drive in drives.items()}
+        for drive, backend in driven.values():
+            for at in range(begin):
+                _come(drive, backend, at)
+            backend.settle()
+        for at in range(begin, keyframes):
+            names = list(driven)
+            began, first = time.monotonic(), at % len(names)
+            for name in names[first:] + names[:first]:
+                drive, backend = driven[name]
+                _come(drive, backend, at)
+                seconds[name].append(_updated(backend)[1])
+            time.sleep(max(began + _PERIOD - time.monotonic(), 0.0))
+    for name, drive in drives.items():
+        del seconds[name][:_WARM]
+        median, most = np.percentile(seconds[name], (50, 99)) * 1e3
+        loops = np.count_nonzero(drive.last >= begin + _WARM) / (timed - _WARM)
+        print(f'  {name}: {loops:.2f} loops an update, {median:.2f} ms of the processor in the '
+              f'median, p99 {most:.2f} ms', flush=True)
+    return seconds
+
+
+def ratios(keyframes: int, timed: int, seeds: int) -> None:
+    """Print how the 99th percentiles of several robots compare with that of one."""
+    found: dict[str, list[list[float]]] = {}
+    for seed in range(seeds):
+        print(f'drive {seed}, {keyframes:,} keyframes in all', flush=True)
+        of_drive = updates(drives_of(keyframes, timed, seed), keyframes, timed)
+        for name, seconds in of_drive.items():
+            found.setdefault(name, []).append(seconds)
+    of_one = next(iter(found.values()))
+    for name, ours in found.items():
+        median, most = np.percentile(np.concatenate(ours), (50, 99)) * 1e3
+        over = most / (np.percentile(np.concatenate(of_one), 99) * 1e3)
+        of_drives = [float(np.percentile(own, 99) / np.percentile(other, 99))
+                     for own, other in zip(ours, of_one, strict=True)]
+        print(f'{name}, all {seeds} drives: median {median:.2f} ms, p99 {most:.2f} ms, {over:.2f} '
+              f'times that of one; of a drive {statistics.median(of_drives):.2f} times in the '
+              f'median, {min(of_drives):.2f} to {max(of_drives):.2f}', flush=True)
+
+
+def _come(drive: Drive, backend: Backend, at: int) -> None:
+    """Let a keyframe come, and the loops that it is the last of."""
+    drive.add(backend, at)
+    for loop in drive.loops_of(at):
+        backend.add_loop(loop)
 
 
 def rendezvous(keyframes: int) -> None:
@@ -143,7 +194,7 @@ def rendezvous(keyframes: int) -> None:
             backend.add_loop(loop)
         began, busy = time.monotonic(), time.process_time()
         while time.monotonic() < began + _PATIENCE:
-            seconds.append(_update(backend)[0])
+            seconds.append(_update(backend))
             robot = backend.robot(1)
             if robot is not None and robot.joined:
                 break
@@ -152,13 +203,18 @@ def rendezvous(keyframes: int) -> None:
               f'most, in one map after {took:.2f} s, {busy:.2f} s of the processor')
 
 
-def _update(backend: Backend) -> tuple[float, float]:
-    """Update, wait for the next period; return how long it took, by clock and processor [s]."""
+def _update(backend: Backend) -> float:
+    """Update, wait for the next period; return how long it took by the clock [s]."""
+    took, _ = _updated(backend)
+    time.sleep(max(_PERIOD - took, 0.0))
+    return took
+
+
+def _updated(backend: Backend) -> tuple[float, float]:
+    """Update; return how long it took, by the clock and of the processor in this thread [s]."""
     began, busy = time.monotonic(), time.thread_time()
     backend.update(0.0)
-    took, busy = time.monotonic() - began, time.thread_time() - busy
-    time.sleep(max(_PERIOD - took, 0.0))
-    return took, busy
+    return time.monotonic() - began, time.thread_time() - busy
 
 
 def main() -> None:
@@ -167,12 +223,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--keyframes', type=int, default=KEYFRAMES)
     parser.add_argument('--timed', type=int, default=TIMED, help='keyframes with an update each')
+    parser.add_argument('--seeds', type=int, default=SEEDS, help='how many drives')
     given = parser.parse_args()
-    one, five = (Drive(given.keyframes, robots) for robots in (1, ROBOTS))
-    begin, single = given.keyframes - given.timed, updates(one, given.timed)
-    print(f'ratio of p99, of the processor: {updates(five, given.timed) / single:.2f}')
-    five.thin(begin, int(np.count_nonzero(one.last >= begin)))
-    print(f'with as many loops: {updates(five, given.timed) / single:.2f}')
+    ratios(given.keyframes, given.timed, given.seeds)
     rendezvous(given.keyframes)
 
 

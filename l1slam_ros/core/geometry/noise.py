@@ -18,6 +18,7 @@ A measurement may say nothing of some components: their rows and columns are zer
 information, in its root, and in the covariance that stands for it here.
 """
 
+import math
 from hashlib import blake2b
 
 import numpy as np
@@ -256,7 +257,7 @@ def distinct(matrices: Array) -> tuple[Indices, Indices]:
 
     Measurements mostly share a few. Where more than a tenth of them differ, each is its own.
     """
-    flat = matrices.reshape(len(matrices), np.prod(matrices.shape[1:]))
+    flat = matrices.reshape(len(matrices), math.prod(matrices.shape[1:]))
     # Equal matrices have the same sum of entries, each times a number of its own.
     with np.errstate(invalid='ignore', over='ignore'):
         sums = flat @ np.sqrt(np.arange(2.0, 2 + flat.shape[1]))

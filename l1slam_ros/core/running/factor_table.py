@@ -82,6 +82,10 @@ class FactorTable:
         """Whether all factors of which a bound was proved are accepted still."""
         return not (self.rows['proved'][:self.looked] & ~self.accepted).any()
 
+    def continues(self, earlier: 'FactorTable') -> bool:
+        """Tell whether the table only has rows more than an earlier one, in the same memory."""
+        return self._store is earlier._store
+
     def judgement(self, of_all: Judgement) -> Judgement:
         """Return the rows as a judgement; of_all : the last one, for values that have no rows."""
         rows = self.rows[~np.isnan(self.rows['noise'])]

@@ -48,21 +48,19 @@ class MapToOdom:
         # Asked for with every sample: worked out when an update or a new offset changes it.
         self._known: tuple[Array, Array] | None = None
 
-    def move(self, robot: RobotOdometry, newest: Newest) -> None:
-        """Update the transform to the present end of the map."""
+    def move(self, robot: RobotOdometry, newest: Newest, now: Array) -> None:
+        """Update the transform to the present end of the map; now : what it is there."""
         before = self.now(robot)
         self.begin(newest)
-        self._moved = (self._moved or (before,))[0], self.now(robot)
+        self._known = robot.offset, now
+        self._moved = (self._moved or (before,))[0], now
 
     def now(self, robot: RobotOdometry) -> Array:
         """Return the transform; robot : whose it is."""
-        offset, manifold = robot.offset, robot.manifold
         if self._newest.keyframe < 0:
-            return manifold.identity(1)
-        if self._known is None or self._known[0] is not offset:
-            odometry = robot.track.poses_of(np.array([self._newest.keyframe]))
-            to_kept = manifold.compose(self._newest.pose, manifold.inverse(odometry))
-            self._known = offset, manifold.compose(to_kept, offset)
+            return robot.manifold.identity(1)
+        if self._known is None or self._known[0] is not robot.offset:
+            self._known = robot.offset, _transforms([(robot, self._newest)])
         return self._known[1]
 
     def moved(self, robot: RobotOdometry) -> tuple[Array, Array]:
@@ -70,3 +68,22 @@ class MapToOdom:
         before, after = self._moved or 2 * (self.now(robot),)
         self._moved = None
         return before, after
+
+
+def move_all(some: list[tuple[MapToOdom, RobotOdometry, Newest]]) -> None:
+    """Update transforms of robots to the present ends of their maps."""
+    if not some:
+        return
+    now = _transforms([(robot, newest) for _, robot, newest in some])
+    for row, (transform, robot, newest) in enumerate(some):
+        transform.move(robot, newest, now[row:row + 1])
+
+
+def _transforms(ends: list[tuple[RobotOdometry, Newest]]) -> Array:
+    """Return the transforms of robots by the ends of their maps, (r, p)."""
+    manifold = ends[0][0].manifold
+    odometry = np.concatenate([
+        robot.track.poses_of(np.array([newest.keyframe])) for robot, newest in ends])
+    to_kept = manifold.compose(np.concatenate([newest.pose for _, newest in ends]),
+                               manifold.inverse(odometry))
+    return manifold.compose(to_kept, np.concatenate([robot.offset for robot, _ in ends]))

@@ -29,6 +29,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, lowest_of_components
 from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.running.factor_table import FactorTable
 from l1slam_ros.core.running.map_to_odom import Newest
 
 
@@ -44,8 +45,8 @@ class RobotMap(NamedTuple):
     turn: Array | None
 
 
-def robot_maps(manifold: Manifold, robot: Indices, firsts: Indices, factors: BetweenFactors,
-               accepted: Mask, odometry: Callable[[Indices], Array],
+def robot_maps(manifold: Manifold, robot: Indices, firsts: Indices, pairs: Indices,
+               odometry: Callable[[Indices], Array],
                pose: Callable[[Indices], Array]) -> dict[int, RobotMap]:
     """
     Return the map that each robot is in, by its number.
@@ -54,14 +55,14 @@ def robot_maps(manifold: Manifold, robot: Indices, firsts: Indices, factors: Bet
     ----------
     robot : (n,) of each keyframe
     firsts : (r,) the first keyframe of each robot, by the numbers of these
-    factors, accepted : and which of the first ones are, (m,) bool
+    pairs : (k, 2) the robots that factors join, see `pairs_of`
     odometry, pose : return of some keyframes their odometry, and where they are, (k, p) each
 
     """
     numbers = robot[firsts]
     if len(numbers) < 2:
         return {number: RobotMap(True, None) for number in numbers.tolist()}
-    joined, root = _joined(robot, numbers, factors, accepted)
+    joined, root = _joined(numbers, pairs)
     # The frame of the graph is that of the world, or of its first keyframe.
     root = None if root is None or firsts[root] == 0 else root
     if root is None and joined.all():
@@ -95,20 +96,52 @@ class Seen(NamedTuple):
         return Seen(builder.graph.manifold, builder.graph.between, builder.graph.robot,
                     {robot: track.numbers.view() for robot, track in tracks.items()}, firsts)
 
-    def maps(self, known: int, accepted: Mask,
+    def pairs(self, accepted: Mask, known: int) -> Indices:
+        """Return the robots that accepted factors of the first keyframes join, see `pairs_of`."""
+        i, j = self.factors.i[:len(accepted)], self.factors.j[:len(accepted)]
+        rows = accepted & (i < known) & (j < known) if len(self.numbers) > 1 else accepted[:0]
+        return pairs_of(self.robot, self.factors, rows)
+
+    def maps(self, known: int, pairs: Indices,
              pose: Callable[[Indices], Array]) -> dict[int, RobotMap]:
         """Return the maps of robots by the first keyframes, see `robot_maps`."""
         if len(self.numbers) < 2:
             return {}
-        factors, m = self.factors, len(accepted)
-        inside = (factors.i[:m] < known) & (factors.j[:m] < known)
 
         def odometry(keyframes: Indices) -> Array:
             return np.concatenate([self.firsts[robot] for robot in self.robot[keyframes].tolist()])
 
         firsts = np.array([numbers[0] for _, numbers in sorted(self.numbers.items())])
-        return robot_maps(self.manifold, self.robot, firsts[firsts < known], factors,
-                          accepted[:len(inside)] & inside, odometry, pose)
+        return robot_maps(self.manifold, self.robot, firsts[firsts < known], pairs, odometry, pose)
+
+
+class Joins:
+    """
+    The robots that the accepted factors of a front join.
+
+    Every update asks, of thousands of factors: while the table of factors only grows, none is
+    looked at twice.
+    """
+
+    def __init__(self) -> None:
+        self._table: FactorTable | None = None
+        self._rows = 0
+        self._pairs: set[tuple[int, int]] = set()
+
+    def ends(self, seen: Seen, table: FactorTable, poses: Array,
+             front: Front | None) -> dict[int, Newest]:
+        """Return the last keyframe of each robot in a front, or a map, see `map_ends`."""
+        if front is None or len(seen.numbers) < 2:
+            return map_ends(seen, poses, front, table.accepted)
+        # It knows the keyframes of all factors that it has looked at.
+        accepted = table.accepted[:front.rows]
+        if self._table is None or not table.continues(self._table):
+            self._rows, self._pairs = 0, set()
+        new = pairs_of(seen.robot, seen.factors, accepted[self._rows:], self._rows)
+        self._pairs.update(map(tuple, new.tolist()))
+        self._table, self._rows = table, max(self._rows, len(accepted))
+        return _ends(seen, front.keyframes, front.poses_of,
+                     np.array(sorted(self._pairs), np.int64).reshape(-1, 2))
 
 
 def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> dict[int, Newest]:
@@ -118,8 +151,14 @@ def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> d
     accepted : which of the first factors are
     """
     known = front.keyframes if front else len(poses)
-    pose = front.poses_of if front else poses.__getitem__
-    maps = seen.maps(known, accepted, pose)
+    return _ends(seen, known, front.poses_of if front else poses.__getitem__,
+                 seen.pairs(accepted, known))
+
+
+def _ends(seen: Seen, known: int, pose: Callable[[Indices], Array],
+          pairs: Indices) -> dict[int, Newest]:
+    """Return them of the first keyframes; pairs : (k, 2) the robots that their factors join."""
+    maps = seen.maps(known, pairs, pose)
     lasts = {robot: last for robot, numbers in seen.numbers.items()
              if (last := int(np.searchsorted(numbers, known)) - 1) >= 0}
     if not lasts:
@@ -134,21 +173,28 @@ def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> d
     return ends
 
 
-def _joined(robot: Indices, numbers: Indices, factors: BetweenFactors,
-            accepted: Mask) -> tuple[Mask, int | None]:
+def pairs_of(robot: Indices, factors: BetweenFactors, accepted: Mask, begin: int = 0) -> Indices:
+    """
+    Return the robots that accepted factors join, (k, 2), each pair once; `WORLD` is the world.
+
+    robot : (n,) of each keyframe; accepted : which of the factors from row `begin` on are
+    """
+    rows = begin + np.flatnonzero(accepted)
+    i, j = factors.i[rows], factors.j[rows]
+    one, other = np.where(i == WORLD, WORLD, robot[i]), robot[j]
+    apart = one != other
+    span = int(other.max(initial=0)) + 1
+    pair = np.unique((one[apart] - WORLD) * span + other[apart])
+    one, other = np.divmod(pair, span)
+    return np.stack((one + WORLD, other), axis=1)
+
+
+def _joined(numbers: Indices, pairs: Indices) -> tuple[Mask, int | None]:
     """Return which robots are joined to the first one, (r,), or the world: then None, else it."""
-    r = len(numbers)
-    # Of thousands of factors few join robots, and every update asks: small numbers take less time.
-    place = np.searchsorted(numbers, robot).astype(np.min_scalar_type(r))
-    i, j = factors.i[:len(accepted)], factors.j[:len(accepted)]
-    one, other = place[i], place[j]
-    rows = np.flatnonzero(accepted & ((one != other) | (i == WORLD)))
+    r, of_world = len(numbers), pairs == WORLD
     # The world comes after the robots.
-    one = np.where(i[rows] == WORLD, r, one[rows].astype(np.int64))
-    # Few pairs of robots.
-    pairs = np.flatnonzero(np.bincount(one * r + other[rows]))
-    one, other = np.divmod(pairs, r)
+    one, other = np.where(of_world, r, np.searchsorted(numbers, pairs)).T
     component = lowest_of_components(one, other, r + 1)
-    if (one == r).any():
+    if of_world.any():
         return component[:-1] == component[-1], None
     return component[:-1] == component[0], 0

@@ -28,7 +28,7 @@ from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.map_state import MapState
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.problem import Problem
-from l1slam_ros.core.running.robot_maps import RobotMap, robot_maps
+from l1slam_ros.core.running.robot_maps import RobotMap, pairs_of, robot_maps
 from l1slam_ros.core.solvers.block_cholesky import Pattern
 
 # The states of a loop; `LoopStates.state` holds indices of this tuple.
@@ -168,8 +168,8 @@ class Snapshot:
         """The map that each robot is in, by its number."""
         graph = self.graph
         _, firsts = np.unique(self.graph.robot, return_index=True)
-        return robot_maps(graph.manifold, graph.robot, firsts, graph.between,
-                          self.judgement.accepted,
+        pairs = pairs_of(graph.robot, graph.between, self.judgement.accepted)
+        return robot_maps(graph.manifold, graph.robot, firsts, pairs,
                           lambda keyframes: self.odometry[keyframes],
                           lambda keyframes: self.poses[keyframes])
 

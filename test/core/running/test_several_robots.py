@@ -21,6 +21,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.running.backend import Backend, BackendOptions
 from l1slam_ros.core.running.keeper import schedule
+from l1slam_ros.core.running.robot_maps import Joins, map_ends
 from l1slam_ros.io.graphs.saved_map import load_map, save_map
 
 EVERY = BackendOptions.from_mapping({
@@ -81,6 +82,37 @@ def test_a_robot_that_nothing_joins_has_its_own_map_and_moves_whole_when_a_loop_
     assert np.abs(poses - truth)[:, :2].max() < 0.7
     assert_allclose(se2.compose(one.map_to_odom, one.odometry), poses[-1:], atol=1e-9)
     assert_array_equal(keyframes, now.poses_in_map(1)[0])
+
+
+def test_what_joins_robots_is_the_same_found_as_it_comes_and_found_anew(monkeypatch):
+    """Three robots, with lies: tables grow, and are judged anew."""
+    found, ends = [], Joins.ends
+
+    def both(self, seen, table, poses, front):
+        goes_on = self._table is not None and table.continues(self._table)
+        quick, slow = ends(self, seen, table, poses, front), map_ends(
+            seen, poses, front, table.accepted)
+        assert {k: one.joined for k, one in quick.items()} == {
+            k: one.joined for k, one in slow.items()}
+        assert_array_equal(*(np.concatenate([one.pose for one in all_.values()])
+                             for all_ in (quick, slow)))
+        found.append((sum(one.joined for one in quick.values()), goes_on))
+        return quick
+
+    monkeypatch.setattr(Joins, 'ends', both)
+    team, backend = Team(n=180, edges=600, lies=60, robots=3), Backend(EVERY)
+    messages = team.messages()
+    for k, (robot, message) in enumerate(messages):
+        if k in (len(messages) // 10, len(messages) // 2):
+            backend.settle()
+        if isinstance(message, OdometrySample):
+            backend.add_odometry(message, robot)
+            backend.update(0.0)
+        else:
+            backend.add_loop(message)
+    backend.settle()
+    assert {1, 3} <= {joined for joined, _ in found}
+    assert {True, False} == {goes_on for _, goes_on in found[1:]}
 
 
 def test_a_front_takes_nothing_of_more_than_it_would_take_while_that_is_judged(monkeypatch):

@@ -308,8 +308,10 @@ class OdometryTrack:
         return self._manifold.interpolate(poses[before], poses[after], fraction)
 
     def _part(self, times: Indices, column: int, count: int) -> tuple[Indices, Indices]:
-        """Return the first sample or keyframe, and past the last, of the part of each time."""
+        """Return the first sample or keyframe, and past the last, of the part of each, or all."""
         parts = self._parts.view()
+        if len(parts) == 1:  # as of most: every loop asks
+            return parts[:, column], np.array([count])
         part = np.maximum(np.searchsorted(parts[:, 1], times, side='right') - 1, 0)
         bounds = np.append(parts[:, column], count)
         return bounds[part], bounds[part + 1]

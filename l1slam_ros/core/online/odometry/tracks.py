@@ -81,7 +81,7 @@ class Tracks:
     def of_each(self, robots: Indices) -> 'Ends':
         """Return what is asked of the tracks of some robots, (m,), one for each end of loops."""
         return Ends([(self._tracks[robot], np.flatnonzero(robots == robot))
-                     for robot in np.unique(robots).tolist()], len(robots))
+                     for robot in sorted(set(robots.tolist()))], len(robots))
 
 
 class Ends:

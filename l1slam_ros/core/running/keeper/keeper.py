@@ -39,9 +39,9 @@ from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.core.running.keeper.schedule import Size
 from l1slam_ros.core.running.map_state import Carried, MapState
-from l1slam_ros.core.running.map_to_odom import MapToOdom, Newest
+from l1slam_ros.core.running.map_to_odom import MapToOdom, Newest, move_all
 from l1slam_ros.core.running.optimised import Optimised
-from l1slam_ros.core.running.robot_maps import Seen, map_ends
+from l1slam_ros.core.running.robot_maps import Joins, Seen, map_ends
 from l1slam_ros.core.running.snapshot import Robot, SavedMap, Snapshot
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
@@ -88,6 +88,7 @@ class Keeper:
         nothing = Optimised.nothing(builder.graph.manifold.identity(0))
         # By robot.
         self._odom: dict[int, MapToOdom] = {}
+        self._joins = Joins()
         self._revisions = Revisions()
         self._state = MapState.beginning(0, robust, nothing, Judgement.nothing(), 0)
 
@@ -263,10 +264,9 @@ class Keeper:
             time.sleep(0)  # else a thread that waits for the lock would wait for the deadline
         if taken:
             with self._front_lock:
-                state = self._state
                 with self._graph_lock:
-                    seen = Seen.of(self._builder)
-                ends = map_ends(seen, state.optimised.poses, self._front, state.table.accepted)
+                    front, state, seen = self._front, self._state, Seen.of(self._builder)
+                ends = self._joins.ends(seen, state.table, state.optimised.poses, front)
                 with self._graph_lock:
                     if self._state.began == state.began:
                         self._move(ends)
@@ -296,8 +296,8 @@ class Keeper:
 
     def _move(self, ends: Mapping[int, Newest]) -> None:
         """Note a changed map; ends : its last keyframe of each robot; the graph is locked."""
-        for robot, end in ends.items():
-            self._odom_of(robot).move(self._builder.robots[robot], end)
+        move_all([(self._odom_of(robot), self._builder.robots[robot], end)
+                  for robot, end in ends.items()])
         self._revisions = self._revisions.after(map=True)
 
     # What the workers make.
