@@ -119,7 +119,7 @@ class ScanOdometry:
         self._map: Submap | None = None
         self._pose = np.zeros(3)
         self._covariance = np.zeros((3, 3))
-        # Where the wheels say it is, of a start that scans have found.
+        # Where the wheels say it is, from the last keyframe on.
         self._told, self._untold = np.zeros(3), np.zeros((3, 3))
         self._wheels: Array | None = None
         self._unmatched = 0
@@ -134,20 +134,19 @@ class ScanOdometry:
             return self._begin(stamp, points)
         motion = se2.between(self._wheels[None], wheels[None])[0]
         self._wheels = wheels
+        expected = se2.compose(self._pose[None], motion[None])[0]
         self._told = se2.compose(self._told[None], motion[None])[0]
-        self._pose = se2.compose(self._pose[None], motion[None])[0]
         Ad = se2.adjoint(se2.inverse(motion[None]))[0]
         noise = wheel_covariance(motion)
-        trusted = Ad @ self._untold @ Ad.T + noise
+        trusted = Ad @ self._covariance @ Ad.T + noise
         if self._distrusted:
             self._distrusted -= 1
             noise = noise + np.diag((_WRONG * motion) ** 2)
+        predicted = Ad @ self._covariance @ Ad.T + noise
         self._untold = Ad @ self._untold @ Ad.T + noise
-        self._covariance = Ad @ self._covariance @ Ad.T + noise
         self._blind = self._blind + (np.hypot(motion[0], motion[1]), abs(motion[2]))
-        told = self._told
-        said = self._follow(points)
-        off = se2.local(told[None], self._pose[None])[0]
+        said = self._follow(expected, predicted, points)
+        off = se2.local(expected[None], self._pose[None])[0]
         if self._distrusted and off @ np.linalg.solve(trusted, off) > _GATE:
             self._distrusted = _DISTRUST
         if self._unmatched >= _LOST_AFTER and self._blind.sum() >= _LOST_WAY:
@@ -164,46 +163,54 @@ class ScanOdometry:
         self._distrusted = 0
         self._blind = np.zeros(2)
 
-    def _follow(self, points: Points) -> str:
+    def _follow(self, expected: Array, predicted: Array, points: Points) -> str:
         """Find the pose at a scan from what the wheels expect; return what is to be said."""
-        information: Array = np.linalg.inv(self._untold).astype(float)
-        found, covariance = self._match(self._pose, information, points)
+        information: Array = np.linalg.inv(predicted).astype(float)
+        found, covariance = self._match(expected, expected, information, points)
         pose = found.pose
         fits = covariance is not None and found.matched >= _MATCHED
         helps = covariance is not None and found.matched >= _FOUND
         if covariance is None:
-            self._pose, self._covariance = self._told, self._untold
-            pose, covariance = self._pose, self._covariance
+            pose, covariance = expected, predicted
+            if self._is_beyond_wheels(expected):
+                expected, predicted = pose, covariance = self._told, self._untold
         agree = 1.0 if fits and found.matched >= _MUCH else self._free_space(pose, points)
         if fits and not agree < _AGREE:
             self._take(pose, covariance)
             return ''
-        searched = self._search(points)
+        searched = self._search(expected, points)
         if searched is not None and self._free_space(searched.pose, points) >= np.fmax(
                 agree, _LEAST_AGREE):
-            return self._follow_search(searched, information, points)
+            return self._follow_search(searched, expected, information, points)
         if fits or agree >= (_LEAST_AGREE if helps else _AGREE):
             # It may have come to where little is known; what matches there still helps.
             self._take(pose, covariance)
         else:
             # Where rays look at nothing, they contradict nothing.
             self._unmatched = 0 if np.isnan(agree) else self._unmatched + 1
+            self._pose, self._covariance = expected, predicted
         return ''
 
-    def _match(self, start: Array, information: Array, points: Points
+    def _match(self, start: Array, expected: Array, information: Array, points: Points
                ) -> tuple[Match, Array | None]:
         """Match from a pose on; return its covariance, too; None: the wheels cannot be right."""
         xy, normals = points.surface
         assert self._field is not None
-        found = match(self._field, xy, normals, start, self._told, information)
-        off = se2.local(self._told[None], found.pose[None])[0]
-        if off @ information @ off > _GATE:
+        found = match(self._field, xy, normals, start, expected, information)
+        off = se2.local(expected[None], found.pose[None])[0]
+        if off @ information @ off > _GATE or self._is_beyond_wheels(found.pose):
             return found, None
         return found, np.linalg.inv(information + found.information).astype(float)
 
-    def _follow_search(self, searched: Match, information: Array, points: Points) -> str:
+    def _is_beyond_wheels(self, pose: Array) -> bool:
+        """Tell whether the wheels, since the last keyframe, speak against a pose."""
+        off = se2.local(self._told[None], pose[None])[0]
+        return bool(off @ np.linalg.solve(self._untold, off) > _GATE)
+
+    def _follow_search(self, searched: Match, expected: Array, information: Array,
+                       points: Points) -> str:
         """Believe a search; return what is to be said where the wheels say otherwise."""
-        found, covariance = self._match(searched.pose, information, points)
+        found, covariance = self._match(searched.pose, expected, information, points)
         if covariance is not None and found.matched >= _FOUND:
             self._take(found.pose, covariance)
             return ''
@@ -237,7 +244,7 @@ class ScanOdometry:
             return np.nan
         return float((counts[:, 0] / np.maximum(of_each, 1))[of_each > 0].min())
 
-    def _search(self, points: Points) -> Match | None:
+    def _search(self, expected: Array, points: Points) -> Match | None:
         """
         Look for a scan around where one was matched last; None: there is no one place.
 
@@ -248,7 +255,7 @@ class ScanOdometry:
         if len(xy) < _FEWEST or self._field is None:
             return None
         reach, turn = np.minimum(_SEARCH + self._blind, _MOST_SEARCH)
-        centre = np.array([*self._known[:2], self._told[2]])
+        centre = np.array([*self._known[:2], expected[2]])
         peak = search(self._field, xy, centre, reach, turn, _FOUND, _RIVAL)
         if peak is None or peak.second > _RIVAL * peak.score:
             return None
