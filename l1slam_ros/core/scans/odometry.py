@@ -175,18 +175,21 @@ class ScanOdometry:
             if self._is_beyond_wheels(expected):
                 expected, predicted = pose, covariance = self._told, self._untold
         agree = 1.0 if fits and found.matched >= _MUCH else self._free_space(pose, points)
-        if fits and not agree < _AGREE:
+        # Where rays look at nothing, they contradict nothing.
+        if (fits and np.isnan(agree)) or (helps and agree >= _AGREE):
             self._take(pose, covariance)
             return ''
         searched = self._search(expected, points)
-        if searched is not None and self._free_space(searched.pose, points) >= np.fmax(
-                agree, _LEAST_AGREE):
-            return self._follow_search(searched, expected, information, points)
+        if searched is not None:
+            borne_out = self._free_space(searched.pose, points)
+            if borne_out >= np.fmax(agree, _LEAST_AGREE):
+                followed = self._follow_search(searched, borne_out, expected, information, points)
+                if followed is not None:
+                    return followed
         if fits or agree >= (_LEAST_AGREE if helps else _AGREE):
             # It may have come to where little is known; what matches there still helps.
             self._take(pose, covariance)
         else:
-            # Where rays look at nothing, they contradict nothing.
             self._unmatched = 0 if np.isnan(agree) else self._unmatched + 1
             self._pose, self._covariance = expected, predicted
         return ''
@@ -207,13 +210,19 @@ class ScanOdometry:
         off = se2.local(self._told[None], pose[None])[0]
         return bool(off @ np.linalg.solve(self._untold, off) > _GATE)
 
-    def _follow_search(self, searched: Match, expected: Array, information: Array,
-                       points: Points) -> str:
-        """Believe a search; return what is to be said where the wheels say otherwise."""
+    def _follow_search(self, searched: Match, borne_out: float, expected: Array,
+                       information: Array, points: Points) -> str | None:
+        """
+        Believe a search; return what is to be said where the wheels say otherwise.
+
+        None: it is not believed, for the wheels say otherwise, and the rays do not bear it out.
+        """
         found, covariance = self._match(searched.pose, expected, information, points)
         if covariance is not None and found.matched >= _FOUND:
             self._take(found.pose, covariance)
             return ''
+        if borne_out < _AGREE:
+            return None
         self._take(searched.pose, np.linalg.inv(_NEAR_PEAK + searched.information) + _SEARCHED)
         self._told, self._untold = self._pose, self._covariance
         said = '' if self._distrusted else 'the scans disagree with the wheels, and are followed'
@@ -249,13 +258,15 @@ class ScanOdometry:
         Look for a scan around where one was matched last; None: there is no one place.
 
         Wheels that stood still, or turned the other way, have moved the robot no farther from
-        there than they said.
+        there than they said. Where that is farther than a search reaches, it is around where they
+        have the robot.
         """
         xy, normals = points.surface
         if len(xy) < _FEWEST or self._field is None:
             return None
         reach, turn = np.minimum(_SEARCH + self._blind, _MOST_SEARCH)
-        centre = np.array([*self._known[:2], expected[2]])
+        around = self._known if self._blind[0] <= reach else expected
+        centre = np.array([*around[:2], expected[2]])
         peak = search(self._field, xy, centre, reach, turn, _FOUND, _RIVAL)
         if peak is None or peak.second > _RIVAL * peak.score:
             return None
