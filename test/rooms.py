@@ -191,9 +191,9 @@ def write_scan_bag(path, scans, wheels, mount=None):
         for k, (scan, pose) in enumerate(zip(scans, wheels, strict=True)):
             put('/wheels', scan.stamp, odometry(scan.stamp, pose))
             put('/scan', scan.stamp, types['sensor_msgs/msg/LaserScan'](
-                header(scan.stamp, 'laser'), scan.angle_min, 6.28, scan.angle_increment, 0.0, 0.2,
-                scan.range_min, scan.range_max, scan.ranges.astype(np.float32),
-                np.zeros(0, np.float32)))
+                header(scan.stamp, 'laser'), scan.angle_min, 6.28, scan.angle_increment,
+                scan.time_increment, 0.2, scan.range_min, scan.range_max,
+                scan.ranges.astype(np.float32), np.zeros(0, np.float32)))
             if k + 1 < len(scans):
                 between = se2.interpolate(wheels[k][None], wheels[k + 1][None], np.array([0.5]))[0]
                 put('/wheels', scan.stamp + 10**8, odometry(scan.stamp + 10**8, between))

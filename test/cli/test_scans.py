@@ -12,6 +12,7 @@ import bz2
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,9 @@ from PIL import Image
 from rooms import WALLS, laps, write_log, write_scan_bag, write_truth
 
 from l1slam_ros.cli.main import main
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.io.compilation import JUDGEMENT, SCANS, SPARSE, compile_now
+from l1slam_ros.io.scans.bag_scans import read_bag_scans
 
 SOLVE = """
 import sys
@@ -101,6 +104,16 @@ def test_the_scans_of_a_bag_make_the_same_map(drive, truth, tmp_path, capsys):
     again = solved(capsys, bag, '--scans', '/scan', '--odom-topic', '/wheels',
                    '--reference', truth)[1]
     assert {**again, 'seconds': 0} == {**said, 'seconds': 0}, 'nothing goes by the clock'
+
+
+def test_the_scans_of_a_bag_bear_the_velocity_of_the_wheels_meanwhile(drive, tmp_path):
+    scans, wheels = drive[0][:20], drive[1][:20]
+    slow = [replace(scan, time_increment=0.2 / len(scan.ranges)) for scan in scans]
+    write_scan_bag(tmp_path / 'bag', slow, wheels)
+    log = read_bag_scans(tmp_path / 'bag', '/wheels', '/scan')
+    found = np.array([scan.velocity for scan in log.scans[:-1]])
+    np.testing.assert_allclose(found, se2.between(wheels[:-1], wheels[1:]) / 0.2, atol=0.02)
+    assert log.scans[-1].velocity is None  # nothing was heard of the wheels after it
 
 
 def test_a_laser_that_is_turned_upside_down_and_ahead_is_read_off_the_transforms(

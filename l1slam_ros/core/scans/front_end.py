@@ -74,7 +74,8 @@ class ScanFrontEnd:
             moved = se2.between(self._last[1][None], wheels[None])[0]
             self._velocity = moved / seconds if seconds > 0 else None
         self._last = scan.stamp, wheels
-        return self._odometry.add(scan.stamp, points_of(scan, self._mount, self._velocity), wheels)
+        velocity = self._velocity if scan.velocity is None else scan.velocity
+        return self._odometry.add(scan.stamp, points_of(scan, self._mount, velocity), wheels)
 
     def begin_drive(self, mount: Mount) -> None:
         """Let the next scan be the first of another drive, by a laser mounted like this."""

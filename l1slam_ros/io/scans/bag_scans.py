@@ -63,7 +63,12 @@ def read_bag_scans(path: Path, odom_topic: str, scan_topic: str) -> LaserLog:
     out = len(scans) - len(rows)
     skipped = [f'{counted(out, "scan")} left out: no odometry surrounds them'] if out else []
     mount, said = taken.mount()
-    return LaserLog([scans[row] for row in rows], wheels, mount,
+    scans = [scans[row] for row in rows]
+    ends = np.array([min(scan.stamp + max(scan.duration, 0), stamps[-1]) for scan in scans])
+    ahead, _ = wheels_at(stamps, poses, ends)
+    scans = [scan.driven(start, end, (last - scan.stamp) * 1e-9) if last > scan.stamp else scan
+             for scan, start, end, last in zip(scans, wheels, ahead, ends.tolist(), strict=True)]
+    return LaserLog(scans, wheels, mount,
                     (*skipped, *said, *taken.refused), '; '.join(damage))
 
 
