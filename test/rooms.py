@@ -196,9 +196,9 @@ def write_scan_bag(path, scans, wheels, mount=None):
             now = scans[0].stamp + k * int(_PERIOD * 1e9)
             put('/wheels', now, odometry(scan.stamp, pose))
             put('/scan', now, types['sensor_msgs/msg/LaserScan'](
-                header(scan.stamp, 'laser'), scan.angle_min, 6.28, scan.angle_increment, 0.0, 0.2,
-                scan.range_min, scan.range_max, scan.ranges.astype(np.float32),
-                np.zeros(0, np.float32)))
+                header(scan.stamp, 'laser'), scan.angle_min, 6.28, scan.angle_increment,
+                scan.time_increment, 0.2, scan.range_min, scan.range_max,
+                scan.ranges.astype(np.float32), np.zeros(0, np.float32)))
             if k + 1 < len(scans):
                 between = se2.interpolate(wheels[k][None], wheels[k + 1][None], np.array([0.5]))[0]
                 put('/wheels', now + 10**8, odometry(scan.stamp + 10**8, between))

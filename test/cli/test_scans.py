@@ -21,7 +21,9 @@ from PIL import Image
 from rooms import WALLS, laps, write_log, write_scan_bag, write_truth
 
 from l1slam_ros.cli.main import main
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.io.compilation import JUDGEMENT, SCANS, SPARSE, compile_now
+from l1slam_ros.io.scans.bag_scans import read_bag_scans
 
 SOLVE = """
 import sys
@@ -117,6 +119,16 @@ def test_a_clock_that_is_set_back_within_a_bag_is_one_clock_again(drive, tmp_pat
     assert found['warnings'] == ['the clock was set back by 30.0 s in all; stamps are shifted to '
                                  'undo that']
     assert {**found, 'seconds': 0, 'warnings': []} == {**said, 'seconds': 0}
+
+
+def test_the_scans_of_a_bag_bear_the_velocity_of_the_wheels_meanwhile(drive, tmp_path):
+    scans, wheels = drive[0][:20], drive[1][:20]
+    slow = [replace(scan, time_increment=0.2 / len(scan.ranges)) for scan in scans]
+    write_scan_bag(tmp_path / 'bag', slow, wheels)
+    log = read_bag_scans(tmp_path / 'bag', '/wheels', '/scan')
+    found = np.array([scan.velocity for scan in log.scans[:-1]])
+    np.testing.assert_allclose(found, se2.between(wheels[:-1], wheels[1:]) / 0.2, atol=0.02)
+    assert log.scans[-1].velocity is None  # nothing was heard of the wheels after it
 
 
 def test_a_laser_that_is_turned_upside_down_and_ahead_is_read_off_the_transforms(

@@ -64,6 +64,17 @@ def test_a_scan_gets_the_wheels_of_its_stamp():
     assert not queue.counts and queue.take(2.0) is None
 
 
+def test_a_scan_gets_the_velocity_of_the_wheels_while_it_lasted():
+    """As far as they came: it does not wait for its end."""
+    turning = Scan(1 * S, np.ones(5), 0.0, 1.0, time_increment=0.05)
+    for stamps, expected in (((0.9, 1.0, 1.1, 1.2, 1.3), 2.0), ((0.9, 1.1), 1.0)):
+        queue = ScanQueue(lambda: 3)
+        for stamp in stamps:
+            queue.add_wheels(round(stamp * S), at(0.0, max(stamp - 1.0, 0.0) * 2))
+        queue.add_scan(turning)
+        np.testing.assert_allclose(queue.take(2.0)[0].velocity, (0.0, 0.0, expected), atol=1e-6)
+
+
 def test_a_scan_that_no_odometry_surrounds_expires_and_is_counted():
     queue = ScanQueue(lambda: 3)
     queue.add_wheels(10 * S, at(0.0))

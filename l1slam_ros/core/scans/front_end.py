@@ -70,7 +70,7 @@ class ScanFrontEnd:
     def add(self, scan: Scan, wheels: Array) -> Step:
         """Follow the robot to a scan; wheels : (3,) its pose by the wheels at the scan's stamp."""
         jump = self._wheels.follow(scan.stamp, wheels)
-        points = points_of(scan, self._mount, self._wheels.velocity)
+        points = points_of(scan, self._mount, self._wheels.during(scan))
         step = self._odometry.add(scan.stamp, points, self._wheels.pose)
         return replace(step, said='; '.join(filter(None, (jump, step.said)))) if jump else step
 

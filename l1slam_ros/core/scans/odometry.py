@@ -119,6 +119,8 @@ class ScanOdometry:
         self._map: Submap | None = None
         self._pose = np.zeros(3)
         self._covariance = np.zeros((3, 3))
+        # Where the wheels say it is, from the last keyframe on.
+        self._told, self._untold = np.zeros(3), np.zeros((3, 3))
         self._wheels: Array | None = None
         self._unmatched = 0
         self._distrusted = 0
@@ -133,12 +135,15 @@ class ScanOdometry:
         motion = se2.between(self._wheels[None], wheels[None])[0]
         self._wheels = wheels
         expected = se2.compose(self._pose[None], motion[None])[0]
+        self._told = se2.compose(self._told[None], motion[None])[0]
         Ad = se2.adjoint(se2.inverse(motion[None]))[0]
-        trusted = Ad @ self._covariance @ Ad.T + wheel_covariance(motion)
-        predicted = trusted
+        noise = wheel_covariance(motion)
+        trusted = Ad @ self._covariance @ Ad.T + noise
         if self._distrusted:
             self._distrusted -= 1
-            predicted = trusted + np.diag((_WRONG * motion) ** 2)
+            noise = noise + np.diag((_WRONG * motion) ** 2)
+        predicted = Ad @ self._covariance @ Ad.T + noise
+        self._untold = Ad @ self._untold @ Ad.T + noise
         self._blind = self._blind + (np.hypot(motion[0], motion[1]), abs(motion[2]))
         said = self._follow(expected, predicted, points)
         off = se2.local(expected[None], self._pose[None])[0]
@@ -167,19 +172,24 @@ class ScanOdometry:
         helps = covariance is not None and found.matched >= _FOUND
         if covariance is None:
             pose, covariance = expected, predicted
+            if self._is_beyond_wheels(expected):
+                expected, predicted = pose, covariance = self._told, self._untold
         agree = 1.0 if fits and found.matched >= _MUCH else self._free_space(pose, points)
-        if fits and not agree < _AGREE:
+        # Where rays look at nothing, they contradict nothing.
+        if (fits and np.isnan(agree)) or (helps and agree >= _AGREE):
             self._take(pose, covariance)
             return ''
         searched = self._search(expected, points)
-        if searched is not None and self._free_space(searched.pose, points) >= np.fmax(
-                agree, _LEAST_AGREE):
-            return self._follow_search(searched, expected, information, points)
+        if searched is not None:
+            borne_out = self._free_space(searched.pose, points)
+            if borne_out >= np.fmax(agree, _LEAST_AGREE):
+                followed = self._follow_search(searched, borne_out, expected, information, points)
+                if followed is not None:
+                    return followed
         if fits or agree >= (_LEAST_AGREE if helps else _AGREE):
             # It may have come to where little is known; what matches there still helps.
             self._take(pose, covariance)
         else:
-            # Where rays look at nothing, they contradict nothing.
             self._unmatched = 0 if np.isnan(agree) else self._unmatched + 1
             self._pose, self._covariance = expected, predicted
         return ''
@@ -191,18 +201,30 @@ class ScanOdometry:
         assert self._field is not None
         found = match(self._field, xy, normals, start, expected, information)
         off = se2.local(expected[None], found.pose[None])[0]
-        if off @ information @ off > _GATE:
+        if off @ information @ off > _GATE or self._is_beyond_wheels(found.pose):
             return found, None
         return found, np.linalg.inv(information + found.information).astype(float)
 
-    def _follow_search(self, searched: Match, expected: Array, information: Array,
-                       points: Points) -> str:
-        """Believe a search; return what is to be said where the wheels say otherwise."""
+    def _is_beyond_wheels(self, pose: Array) -> bool:
+        """Tell whether the wheels, since the last keyframe, speak against a pose."""
+        off = se2.local(self._told[None], pose[None])[0]
+        return bool(off @ np.linalg.solve(self._untold, off) > _GATE)
+
+    def _follow_search(self, searched: Match, borne_out: float, expected: Array,
+                       information: Array, points: Points) -> str | None:
+        """
+        Believe a search; return what is to be said where the wheels say otherwise.
+
+        None: it is not believed, for the wheels say otherwise, and the rays do not bear it out.
+        """
         found, covariance = self._match(searched.pose, expected, information, points)
         if covariance is not None and found.matched >= _FOUND:
             self._take(found.pose, covariance)
             return ''
+        if borne_out < _AGREE:
+            return None
         self._take(searched.pose, np.linalg.inv(_NEAR_PEAK + searched.information) + _SEARCHED)
+        self._told, self._untold = self._pose, self._covariance
         said = '' if self._distrusted else 'the scans disagree with the wheels, and are followed'
         self._distrusted = _DISTRUST
         return said
@@ -236,13 +258,15 @@ class ScanOdometry:
         Look for a scan around where one was matched last; None: there is no one place.
 
         Wheels that stood still, or turned the other way, have moved the robot no farther from
-        there than they said.
+        there than they said. Where that is farther than a search reaches, it is around where they
+        have the robot.
         """
         xy, normals = points.surface
         if len(xy) < _FEWEST or self._field is None:
             return None
         reach, turn = np.minimum(_SEARCH + self._blind, _MOST_SEARCH)
-        centre = np.array([*self._known[:2], expected[2]])
+        around = self._known if self._blind[0] <= reach else expected
+        centre = np.array([*around[:2], expected[2]])
         peak = search(self._field, xy, centre, reach, turn, _FOUND, _RIVAL)
         if peak is None or peak.second > _RIVAL * peak.score:
             return None
@@ -282,6 +306,7 @@ class ScanOdometry:
         self._field = Field.of(transformed(keyframe.pose, local.xy),
                                rotated(keyframe.pose, local.normals))
         self._covariance = np.zeros((3, 3))
+        self._told, self._untold = keyframe.pose, self._covariance
 
 
 def wheel_covariance(motion: Array) -> Array:

@@ -14,10 +14,11 @@ points at equal distances along what was seen, each with the normal of its surfa
 how far was seen in each direction.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.scans import kernels
@@ -49,7 +50,8 @@ class Scan:
 
     stamp : of the first ray [ns]; ranges : (r,) [m]; angle_min, angle_increment : of the rays
     [rad], counter-clockwise; range_min, range_max : ranges outside are of no surface [m];
-    time_increment : between rays [s]
+    time_increment : between rays [s]; velocity : (3,) of the robot while it scanned, by its
+    wheels, in its own frame [m/s, m/s, rad/s]; None: nobody has looked
     """
 
     stamp: int
@@ -59,6 +61,16 @@ class Scan:
     range_min: float = 0.0
     range_max: float = np.inf
     time_increment: float = 0.0
+    velocity: Array | None = field(default=None, kw_only=True)
+
+    @property
+    def duration(self) -> int:
+        """How long it took from the first ray to the last [ns]."""
+        return round(1e9 * self.time_increment * (len(self.ranges) - 1))
+
+    def driven(self, start: Array, end: Array, seconds: float) -> 'Scan':
+        """Return it with the velocity between two poses (3,), so long one after the other."""
+        return replace(self, velocity=se2.between(start[None], end[None])[0] / seconds)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans.points import Scan
 
 # A step is a jump if it is more than so far [m, rad], more than so fast [m/s, rad/s], and so many
 # times as far as the robot moved before: wheels that slip, or turn at once, do none.
@@ -49,16 +50,26 @@ class Wheels:
             return ''
         seconds = (stamp - before[0]) * 1e-9
         moved = se2.between(before[1][None], wheels[None])[0]
-        usual = np.zeros(3) if self.velocity is None else seconds * self.velocity
-        far = np.fmax(seconds * _FAST, _TIMES * _length(usual))
         said = ''
-        if np.any(_length(moved) > np.fmax(_FAR, far)):
+        if self._is_jump(moved, seconds):
+            moved = np.zeros(3) if self.velocity is None else seconds * self.velocity
             said = 'the wheels jump further than a robot moves; it is taken to go on as before'
-            moved = usual
         elif seconds > 0:
             self.velocity = moved / seconds
         self.pose = se2.compose(self.pose[None], moved[None])[0]
         return said
+
+    def during(self, scan: Scan) -> Array | None:
+        """Return the velocity (3,) while a scan lasted: what it says, unless the wheels jumped."""
+        seconds = 1e-9 * scan.duration
+        if scan.velocity is None or self._is_jump(seconds * scan.velocity, seconds):
+            return self.velocity
+        return scan.velocity
+
+    def _is_jump(self, moved: Array, seconds: float) -> bool:
+        usual = np.zeros(3) if self.velocity is None else seconds * self.velocity
+        far = np.fmax(seconds * _FAST, _TIMES * _length(usual))
+        return bool(np.any(_length(moved) > np.fmax(_FAR, far)))
 
 
 def _length(motion: Array) -> Array:

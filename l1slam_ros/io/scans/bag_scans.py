@@ -56,16 +56,21 @@ def read_bag_scans(path: Path, odom_topic: str, scan_topic: str) -> LaserLog:
                         f'{odom_topic}; expected 2 or more')
     stamps, scans, shifted = taken.in_order()
     rows = not_falling(stamps.tolist())
-    wheels, found = wheels_at(
-        stamps[rows], np.array(taken.poses)[rows], np.array([scan.stamp for scan in scans]))
+    stamps, poses = stamps[rows], np.array(taken.poses)[rows]
+    wheels, found = wheels_at(stamps, poses, np.array([scan.stamp for scan in scans]))
     if not len(found):
         raise FileError(path, f'no scan on {scan_topic} lies between two messages on '
                         f'{odom_topic}; expected stamps of one clock')
     out = len(taken.scans) - len(found)
     skipped = [f'{counted(out, "scan")} left out: no odometry surrounds them'] if out else []
     mount, said = taken.mount()
-    return LaserLog([scans[row] for row in found], wheels, mount,
-                    (*shifted, *skipped, *said, *taken.refused), '; '.join(damage))
+    used = [scans[row] for row in found]
+    ends = np.array([min(scan.stamp + max(scan.duration, 0), stamps[-1]) for scan in used])
+    ahead, _ = wheels_at(stamps, poses, ends)
+    used = [scan.driven(start, end, (last - scan.stamp) * 1e-9) if last > scan.stamp else scan
+            for scan, start, end, last in zip(used, wheels, ahead, ends.tolist(), strict=True)]
+    return LaserLog(used, wheels, mount, (*shifted, *skipped, *said, *taken.refused),
+                    '; '.join(damage))
 
 
 class _Taken:

@@ -108,7 +108,7 @@ class ScanQueue:
             if found is None:
                 self.counts['expired'] += 1
             else:
-                self._ready.append((scan, found))
+                self._ready.append((self._driven(scan, found), found))
         if (waiting := len(self._ready)) > self._backlog():
             # The newest stays; scans that are evenly spaced are easier to match.
             self._ready = deque([*self._ready][(waiting - 1) % 2 :: 2])
@@ -130,6 +130,14 @@ class ScanQueue:
         (end, last) = wheels[1]
         fraction = np.array([(stamp - begin) / (end - begin)])
         return se2.interpolate(first[None], last[None], fraction)[0]
+
+    def _driven(self, scan: Scan, start: Array) -> Scan:
+        """Return a scan with the velocity of the wheels while it lasted, as far as they came."""
+        end = next(((stamp, pose) for stamp, pose in self._wheels
+                    if stamp >= scan.stamp + scan.duration), self._wheels[-1])
+        if scan.duration <= 0 or end[0] <= scan.stamp:
+            return scan
+        return scan.driven(start, end[1], (end[0] - scan.stamp) * 1e-9)
 
     def _may_come(self, stamp: int, longest: int) -> bool:
         """Tell whether odometry before and after a stamp may still come."""

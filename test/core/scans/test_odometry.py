@@ -13,6 +13,9 @@ import pytest
 from rooms import WALLS, along, box, drive, random_rays, ranges_at, ranges_on_the_way
 
 from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.scans import odometry as module
+from l1slam_ros.core.scans.front_end import ScanFrontEnd
+from l1slam_ros.core.scans.matching import Match
 from l1slam_ros.core.scans.odometry import ScanKeyframes, ScanOdometry
 from l1slam_ros.core.scans.points import Scan, points_of
 
@@ -101,6 +104,38 @@ def test_motion_within_a_scan_is_taken_out():
     good, bad = off(period / 240), off(0.0)
     assert np.hypot(*good[:2]) < 0.03 and abs(good[2]) < 0.01
     assert np.hypot(*bad[:2]) > 2 * np.hypot(*good[:2])
+
+
+def test_a_robot_that_begins_to_turn_while_it_scans():
+    """What the wheels did before the scan says nothing of it; what they did meanwhile does."""
+    rng = np.random.default_rng(0)
+    stand, turning, period = np.array([4.5, 1.2, 0.0]), np.array([0.0, 0.0, 1.5]), 0.2
+
+    def turned(velocity):
+        front_end, last = ScanFrontEnd(), None
+        for k in range(4):
+            seen = ranges_on_the_way(stand, np.zeros(3) if k < 3 else turning, period, rng,
+                                     box(0, 0, 9, 6))
+            scan = Scan(k * 200_000_000, seen, 0.0, 2 * np.pi / len(seen), 0.05, 30.0,
+                        period / len(seen), velocity=velocity if k == 3 else None)
+            last = front_end.add(scan, stand)
+        return abs(last.pose[2])
+
+    assert turned(turning) < 0.005 and turned(None) > 0.05
+
+
+def test_matches_that_each_hold_the_robot_back_a_little_do_not_for_long(monkeypatch):
+    """By each scan it stands, little enough against the wheels; but not against all they say."""
+    walls = np.array([(-60, -1, 60, -1), (60, 1, -60, 1)], float)
+    monkeypatch.setattr(module, 'match', lambda *_, **__: Match(
+        np.zeros(3), np.diag((30.0, 50.0, 100.0)) ** 2, 0.6, 0.1))
+    monkeypatch.setattr(module, 'search', lambda *_: None)
+    odometry = ScanOdometry()
+    for k in range(40):
+        seen = ranges_at((0.0, 0.1, 0.0), np.random.default_rng(k), walls)
+        scan = Scan(k, np.where(seen > 8, np.inf, seen), 0.0, 2 * np.pi / len(seen), 0.05, 30.0)
+        step = odometry.add(k, points_of(scan), np.array([0.04 * k, 0.0, 0.0]))
+    assert step.pose[0] > 1.0
 
 
 def test_wheels_that_lie_are_not_followed():
