@@ -27,7 +27,7 @@ small() {  # the title of a run, and its command, which gets the groups behind i
 }
 
 cache=$(mktemp -d)
-trap 'rm -rf "$cache"' EXIT
+trap 'rm -rf "$cache"; rmdir "$memory" "$cpu" 2> /dev/null || true' EXIT
 small 'City, 10,000 keyframes live' "$python" benchmarks/ros/small.py "$data/city10000.g2o" {}
 small 'Intel, with scans' "$python" benchmarks/ros/scans.py \
     "$data/lidar/intel.clf.bz2" "$data/lidar/intel.truth.csv" 40 {}
