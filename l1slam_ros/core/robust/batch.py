@@ -77,7 +77,7 @@ from l1slam_ros.core.robust.judgement import (
     judgement_of,
     listed,
 )
-from l1slam_ros.core.robust.odometry.drift import straightened, vote
+from l1slam_ros.core.robust.odometry.drift import CALMER, explains, straightened, vote, won
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.evidence import REFUSED
@@ -89,10 +89,6 @@ from l1slam_ros.core.solvers.optimality import Status, l1_cost
 
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
-
-# A drift is believed of loops of so many places at least, if it wins as many, if no more than this
-# part of them fits without it, or if the variance of the odometry is so many times as large then.
-_DRIFT_PLACES, _FEW, _CALMER = 4, 0.1, 4.0
 
 # What a factorisation, or numbers beyond double precision, end in.
 _FAILURES = (GraphError, np.linalg.LinAlgError)
@@ -157,15 +153,15 @@ class _Repair:
 
     def _straightened(self, as_stated: Growth) -> Growth | None:
         """Return the state without a drift that explains the loops, or was taken for noise."""
-        if len(as_stated.undecided()) or as_stated.noise.variance[0] > _CALMER:
+        if len(as_stated.undecided()) or as_stated.noise.variance[0] > CALMER:
             voted, odds, rival = vote(self._graph)
             for straight, told in self._without(voted) if odds > 0 else ():
-                if _explains(told, as_stated):
+                if explains(told, as_stated):
                     self.drift, self.rival = voted, rival
                     return straight
         taken = drift_taken_for_noise(as_stated)
         for straight, told in self._without(taken) if taken else ():
-            if _won(as_stated, told) >= _won(as_stated, as_stated):
+            if won(as_stated, told) >= won(as_stated, as_stated):
                 self.drift = taken
                 return straight
         return None
@@ -182,29 +178,6 @@ class _Repair:
         for _ in rounds(growth, lambda *states: ends.append(states)):
             self._check()
         return ends
-
-
-def _explains(told: Growth, as_stated: Growth) -> bool:
-    """
-    Return whether loops need the odometry to be rid of a drift.
-
-    That is, they do not fit without, or only if it is far noisier; or several places are won and
-    it is no noisier, as it would be if lies came in by chance. And the loops are of several
-    places: a lap that closes at one place closes as well if it has a turn more.
-    """
-    loops, before = (np.flatnonzero(state.accepted & state.given.is_loop)
-                     for state in (told, as_stated))
-    if told.given.may_err_as_one(loops, _DRIFT_PLACES):
-        return False
-    calmer = as_stated.noise.variance[0] / told.noise.variance[0]
-    won = _won(as_stated, told) - _won(as_stated, as_stated)
-    return (len(before) <= _FEW * len(loops) or (calmer >= 1 and won >= _DRIFT_PLACES)
-            or (calmer >= _CALMER and 2 * len(loops) > len(before)))
-
-
-def _won(places_of: Growth, growth: Growth) -> int:
-    """Return of how many places the loops are that a state accepts."""
-    return len(np.unique(places_of.given.place[growth.accepted & growth.given.is_loop]))
 
 
 def _so_far(growth: Growth, drift: float = 0.0) -> Believed:

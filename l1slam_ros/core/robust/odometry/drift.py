@@ -40,6 +40,7 @@ from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph, ends
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.places import places
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 # [rad/m] What wheels and gyros drift by: its standard deviation, and the most that is looked for.
 _USUAL, _MOST = 0.03, 0.18
@@ -55,6 +56,10 @@ _NOISE = np.logspace(-3, 3, 13)
 _ROUNDS, _VOTERS = 12, 2000
 # The density of a lie's turn; and what is next to nothing.
 _EVEN, _TINY = 1 / (2 * np.pi), 1e-9
+
+# A drift is believed of loops of so many places at least, if it wins as many, if no more than this
+# part of them fits without it, or if the variance of the odometry is so many times as large then.
+_DRIFT_PLACES, _FEW, CALMER = 4, 0.1, 4.0
 
 
 def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
@@ -99,6 +104,29 @@ def vote(graph: FactorGraph) -> tuple[float, float, float]:
         return 0.0, -np.inf, 0.0
     value, drift = min(near, key=lambda peak: abs(peak[1]))
     return drift, value - none, next((other - drift for _, other in near if other != drift), 0.0)
+
+
+def explains(told: Growth, as_stated: Growth) -> bool:
+    """
+    Return whether loops need the odometry to be rid of a drift.
+
+    That is, they do not fit without, or only if it is far noisier; or several places are won and
+    it is no noisier, as it would be if lies came in by chance. And the loops are of several
+    places: a lap that closes at one place closes as well if it has a turn more.
+    """
+    loops, before = (np.flatnonzero(state.accepted & state.given.is_loop)
+                     for state in (told, as_stated))
+    if told.given.may_err_as_one(loops, _DRIFT_PLACES):
+        return False
+    calmer = as_stated.noise.variance[0] / told.noise.variance[0]
+    more = won(as_stated, told) - won(as_stated, as_stated)
+    return (len(before) <= _FEW * len(loops) or (calmer >= 1 and more >= _DRIFT_PLACES)
+            or (calmer >= CALMER and 2 * len(loops) > len(before)))
+
+
+def won(places_of: Growth, growth: Growth) -> int:
+    """Return of how many places the loops are that a state accepts."""
+    return len(np.unique(places_of.given.place[growth.accepted & growth.given.is_loop]))
 
 
 def _votes_of(graph: FactorGraph, rows: Indices) -> '_Votes':
