@@ -24,6 +24,7 @@ from l1slam_ros.core.solvers.gauss_newton import ROUGH_L2, minimise_l2
 from l1slam_ros.core.solvers.interior_point import Optimum, interior_point
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.optimality import L1, Norm, Status, fits_exactly, l1_cost
+from l1slam_ros.core.solvers.seed import is_near
 
 # It leaves the cost some 10^-6 above the optimum, in flat valleys and small worlds up to 6 10^-6.
 _TOLERANCE = 2e-5
@@ -50,8 +51,9 @@ def minimise_interior_point(
     Minimise the L1 norm of the whitened residuals in `options.outer_iterations` steps at most.
 
     From the L2 map that poses (n, p) lead to, which lies in the middle of the valley; should that
-    end above the poses' own cost (false loops bend it), from the poses themselves. The result is
-    the best poses met, never worse than the start. The L2 map counts as one step.
+    end above the poses' own cost (false loops bend it), or the poses be near it in a large graph,
+    from the poses themselves. The result is the best poses met, never worse than the start. The
+    L2 map counts as one step.
     """
     residual = whitened_residual(graph, poses)
     start = l1_cost(residual)
@@ -60,7 +62,8 @@ def minimise_interior_point(
         return Solution(poses, start, Status.ITERATION_LIMIT, 0, 0, np.array([start]),
                         np.zeros(len(residual)))
     problem = GraphProblem(graph)
-    rough = minimise_l2(graph, poses, ROUGH_L2, cholesky).poses
+    rough = (poses if is_near(graph, poses)
+             else minimise_l2(graph, poses, ROUGH_L2, cholesky).poses)
     optimum = interior_point(problem, rough, cholesky, steps, _TOLERANCE, report)
     if optimum.costs[-1] > start:
         optimum = interior_point(problem, poses, cholesky, steps, _TOLERANCE, report)

@@ -23,7 +23,7 @@ relaxation; Chatterjee and Govindu, "Efficient and robust large-scale rotation a
 for the repeated L1 problem.
 
 A large graph that is clean needs none of it (`first_poses`): the L2 map, to which the relaxation
-leads, is a start as good, and the exact solver goes there first anyway.
+leads, is a start as good, and so are poses near it.
 """
 
 from collections.abc import Callable
@@ -108,7 +108,7 @@ def first_poses(graph: FactorGraph, cholesky: BlockCholesky,
     Arguments as those of `seed_poses`.
     """
     chordal = None
-    if len(graph.between) * graph.manifold.TANGENT_SIZE > _MANY_ROWS:
+    if _is_large(graph):
         chordal = chordal_poses(graph, cholesky)
         poses = None if chordal is None else _clean_map(graph, chordal, cholesky, check)
         if poses is not None:
@@ -124,6 +124,20 @@ def _clean_map(graph: FactorGraph, chordal: Array, cholesky: BlockCholesky,
     if not _is_clean(graph, poses):
         poses = minimise_l2(graph, poses, ROUGH_L2, cholesky, lambda *_: check()).poses
     return poses if _is_clean(graph, poses) else None
+
+
+def is_near(graph: FactorGraph, poses: Array) -> bool:
+    """
+    Tell whether poses (n, p) of a large graph are as good a start of an exact map as its L2 map.
+
+    Measured from 15,000 to 50,000 keyframes: where all fits to within the noise, a step towards
+    the L2 map, which takes as long as one of the exact map, spares none of these; else it does.
+    """
+    return _is_large(graph) and _is_clean(graph, poses)
+
+
+def _is_large(graph: FactorGraph) -> bool:
+    return len(graph.between) * graph.manifold.TANGENT_SIZE > _MANY_ROWS
 
 
 def _is_clean(graph: FactorGraph, poses: Array) -> bool:
