@@ -15,9 +15,10 @@ where loops of two places or more do. A slip is suspected where the odds of one 
 (`motion`), or where loops that are left out agree. Then slip and lies are compared: the step is
 cut, the loops across are asked anew, and the rounds go on from there. To the odds comes half a
 gate for each place that is won and that nothing else explains, less one for each that is lost. A
-slip is believed if that makes it likelier than not. Loops do not make a robot jump: the slip
-repaired, it has to move as at some other step, or rather so than as measured. What fits the loops
-that came in without it did not slip: a lie had bent the map.
+slip is believed if that makes it likelier than not; one that is not sure, only if odometry that is
+noisier than was found does not win more. Loops do not make a robot jump: the slip repaired, it has
+to move as at some other step, or rather so than as measured. What fits the loops that came in
+without it did not slip: a lie had bent the map.
 """
 
 from collections.abc import Iterator
@@ -124,7 +125,9 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if state and evidence > most and (usual or (odds > 0 and len(steps) == 1)):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
-    found = found or _with_runs(growth)
+    if most < SURE:
+        runs_in, gain = _with_runs(growth)
+        found = runs_in if gain > most else found
     if not found and growth.cut.any():
         # In the end more is known than when it was cut.
         now = log_odds_of_slips(growth, motion)
@@ -133,26 +136,27 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     return found
 
 
-def _with_runs(growth: Growth) -> Growth | None:
+def _with_runs(growth: Growth) -> tuple[Growth | None, float]:
     """
-    Return a state with the runs that are left out and noisier odometry explains, None: without.
+    Return a state with the runs left out that noisier odometry explains, or None; what it gains.
 
     The noise is learnt of the loops that came in, which are those that it is small for: a robot
     that backs up, or slides on one floor, errs by more where nothing else looks. A run that is off
-    by no more than that, of whose place nothing is accepted, is rather true than a lie.
+    by no more than that, of whose place nothing is accepted, is rather true than a lie. Where a
+    slip is possible, but not sure, whichever has more for it is taken: see `_gain`.
     """
     given, noise = growth.given, growth.noise
     rows, loops = growth.undecided(), growth.accepted & given.is_loop
     rows = rows[~np.isin(given.place[rows], given.place[loops])]
     if len(rows) < RUN or growth.ventured.any() or given.may_err_as_one(np.flatnonzero(loops)):
-        return None
+        return None, 0.0
     noisier = growth.copy()
     noisier.noise = replace(noise, variance=noise.variance * (_NOISIER, 1.0))
     noisier.solve()
     found = noisier.innovations(rows)
     groups = runs(growth, rows[found.square < given.gate(found.freedom)])
     if not groups:
-        return None
+        return None, 0.0
     state = growth.copy()
     for group in groups:
         state.accepted[group.rows] = state.ventured[group.rows] = True
@@ -164,7 +168,7 @@ def _with_runs(growth: Growth) -> Growth | None:
         state.solve()
     _accept_more(state)
     is_noisier = state.noise.variance[0] > _MOST * min(growth.noise.first[0], 1.0)
-    return None if is_noisier or _gain(growth, growth, state) <= 0 else state
+    return (None, 0.0) if is_noisier else (state, _gain(growth, growth, state))
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
