@@ -15,10 +15,9 @@ where loops of two places or more do. A slip is suspected where the odds of one 
 (`motion`), or where loops that are left out agree. Then slip and lies are compared: the step is
 cut, the loops across are asked anew, and the rounds go on from there. To the odds comes half a
 gate for each place that is won and that nothing else explains, less one for each that is lost. A
-slip is believed if that makes it likelier than not; one that is not sure, only if odometry that is
-noisier than was found does not win more. Loops do not make a robot jump: the slip repaired, it has
-to move as at some other step, or rather so than as measured. What fits the loops that came in
-without it did not slip: a lie had bent the map.
+slip is believed if that makes it likelier than not. Loops do not make a robot jump: the slip
+repaired, it has to move as at some other step, or rather so than as measured. What fits the loops
+that came in without it did not slip: a lie had bent the map.
 """
 
 from collections.abc import Iterator
@@ -142,8 +141,7 @@ def _with_runs(growth: Growth) -> tuple[Growth | None, float]:
 
     The noise is learnt of the loops that came in, which are those that it is small for: a robot
     that backs up, or slides on one floor, errs by more where nothing else looks. A run that is off
-    by no more than that, of whose place nothing is accepted, is rather true than a lie. Where a
-    slip is possible, but not sure, whichever has more for it is taken: see `_gain`.
+    by no more than that, of whose place nothing is accepted, is rather true than a lie.
     """
     given, noise = growth.given, growth.noise
     rows, loops = growth.undecided(), growth.accepted & given.is_loop
