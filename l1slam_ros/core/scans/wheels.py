@@ -19,11 +19,9 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.points import Scan
 
-# A step is a jump if it is more than so far [m, rad], more than so fast [m/s, rad/s], and so many
-# times as far as the robot moved before: wheels that slip, or turn at once, do none.
-_FAR = np.array((1.0, 1.0))
-_FAST = np.array((3.0, 3.0))
-_TIMES = 5.0
+# A step is a jump if it goes further than this [m], faster than this [m/s], and so many times as
+# far as the robot went before: wheels that slip, or turn at once, do none.
+_FAR, _FAST, _TIMES = 1.0, 3.0, 5.0
 
 
 class Wheels:
@@ -51,8 +49,8 @@ class Wheels:
         seconds = (stamp - before[0]) * 1e-9
         moved = se2.between(before[1][None], wheels[None])[0]
         said = ''
-        if self._is_jump(moved, seconds):
-            moved = np.zeros(3) if self.velocity is None else seconds * self.velocity
+        if self.velocity is not None and _is_jump(moved, self.velocity, seconds):
+            moved = seconds * self.velocity
             said = 'the wheels jump further than a robot moves; it is taken to go on as before'
         elif seconds > 0:
             self.velocity = moved / seconds
@@ -62,16 +60,13 @@ class Wheels:
     def during(self, scan: Scan) -> Array | None:
         """Return the velocity (3,) while a scan lasted: what it says, unless the wheels jumped."""
         seconds = 1e-9 * scan.duration
-        if scan.velocity is None or self._is_jump(seconds * scan.velocity, seconds):
-            return self.velocity
-        return scan.velocity
-
-    def _is_jump(self, moved: Array, seconds: float) -> bool:
-        usual = np.zeros(3) if self.velocity is None else seconds * self.velocity
-        far = np.fmax(seconds * _FAST, _TIMES * _length(usual))
-        return bool(np.any(_length(moved) > np.fmax(_FAR, far)))
+        usual, said = self.velocity, scan.velocity
+        if said is None or (usual is not None and _is_jump(seconds * said, usual, seconds)):
+            return usual
+        return said
 
 
-def _length(motion: Array) -> Array:
-    """Return how far a motion (3,) goes, and how much it turns, (2,) [m, rad]."""
-    return np.array((np.hypot(motion[0], motion[1]), abs(motion[2])))
+def _is_jump(moved: Array, velocity: Array, seconds: float) -> bool:
+    """Return whether a robot cannot have moved so, (3,), that had such a velocity (3,) before."""
+    usual = seconds * float(np.hypot(*velocity[:2]))
+    return bool(np.hypot(*moved[:2]) > max(_FAR, _FAST * seconds, _TIMES * usual))
