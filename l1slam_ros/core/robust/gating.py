@@ -28,9 +28,6 @@ Gate = Callable[[Indices], Array]
 
 # Of factors that are believed at one time, any is false with at most this probability.
 DOUBT = 0.01
-# Of so many places or more, believed at one time, this part is false at most; and so many of
-# factors that are false for sure are as likely as one of these.
-_MANY, FALSE_PLACES = 20, 1e-3
 # The noise is judged by so many of the best predicted factors.
 _BEST_PREDICTED = 1000
 _ROUNDS = 100
@@ -76,7 +73,7 @@ def probability(log_odds: Array) -> Array:
 
 def believable(
     found: Innovations, posterior: Posterior, gate: Gate, fits: Mask, believed: int,
-    place: Indices, beside: Array, by_chance: Callable[[], float],
+    place: Indices, beside: Array,
 ) -> Indices:
     """
     Return the factors that may be believed: each by itself, or else together, (k,).
@@ -86,64 +83,24 @@ def believable(
     gate : what squares of true factors stay below, by their freedom; fits : (m,) which do
     believed : how many others are true for sure
     place : (m,) see `places`; beside : (m,) what these say, see `beside_refused`
-    by_chance : returns the log ratio that all but `FALSE_PLACES` of false ones stay below
 
     """
     log_ratio = found.log_ratio()
     odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), believed)
     log_odds = np.logaddexp(
         odds + beside, rivals(found, posterior, (fits, log_ratio, odds), place))
-    fit = np.flatnonzero(fits)
-    good: Indices = fit[at_once((log_ratio - log_odds)[fits], place[fits],
-                                lambda some: log_ratio[fit[some]] > by_chance())]
+    good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits])]
     if not len(good):
         good = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
     return good
 
 
-def at_once(log_odds: Array, place: Indices,
-            rare: Callable[[Indices], Mask] | None = None) -> Indices:
-    """
-    Return which may be believed, all of them at once, surest first.
-
-    As many as are all true but for `DOUBT`. A further one, if those that are no less sure are of
-    `_MANY` places and no more than `FALSE_PLACES` of these are expected to be false (the false
-    discovery rate of Y. Benjamini and Y. Hochberg, 1995), unless false ones fit as well. A place
-    may have been mistaken as a whole: it counts once, by its most doubtful factor.
-
-    Parameters
-    ----------
-    log_odds : (m,) ln (true / false)
-    place : (m,) see `places`
-    rare : returns which of some, (k,), fit better than false ones, (k,) bool; None: nobody knows
-
-    """
+def at_once(log_odds: Array) -> Indices:
+    """Return which may be believed, all of them at once, by ln (true / false), surest first."""
     doubt = probability(-log_odds)
     order = np.argsort(doubt, kind='stable')
-    sure = np.cumsum(doubt[order]) < DOUBT
-    false, count = _false_places(doubt[order], place[order])
-    many = (count >= _MANY) & (false < FALSE_PLACES * count)
-    further = np.flatnonzero(many & ~sure)
-    if rare and len(further):
-        sure[further] = rare(order[further])
-    good: Indices = order[sure]
+    good: Indices = order[np.cumsum(doubt[order]) < DOUBT]
     return good
-
-
-def _false_places(doubt: Array, place: Indices) -> tuple[Array, Indices]:
-    """
-    Return how many places of the first factors may be false, and how many there are, (m,) each.
-
-    doubt : (m,) that each is false, in ascending order; place : (m,) see `places`
-    """
-    order = np.argsort(place, kind='stable')
-    same = np.diff(place[order]) == 0
-    again = order[1:][same]
-    more = doubt.copy()
-    more[again] -= doubt[order[:-1][same]]
-    first = np.ones(len(doubt), bool)
-    first[again] = False
-    return np.cumsum(more), np.cumsum(first)
 
 
 def together(found: Innovations, posterior: Posterior, gate: Gate,
@@ -167,8 +124,8 @@ def together(found: Innovations, posterior: Posterior, gate: Gate,
     agree = square < gate(found.freedom[one] + found.freedom[other])
     gain = both - log_ratio[one] - np.maximum(odds[other], 0.0)
     np.maximum.at(far, one[agree], gain[agree])
-    vouched = np.flatnonzero(far > 0)
-    believed: Indices = vouched[at_once((log_ratio + far - odds)[vouched], place[vouched])]
+    believed: Indices = np.flatnonzero(
+        (log_ratio + far > odds + np.log(1 / DOUBT - 1)) & (far > 0))
     return believed
 
 

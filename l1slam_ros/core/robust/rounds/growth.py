@@ -20,11 +20,10 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.robust.gating import FALSE_PLACES, believable, noise_variance, stand_apart
+from l1slam_ros.core.robust.gating import believable, noise_variance, stand_apart
 from l1slam_ros.core.robust.innovation import (
     LEAST_RATIO,
     Innovations,
@@ -297,29 +296,4 @@ class Growth:
         true = 0 if self.noise.at_their_word else np.count_nonzero(loops)
         return np.asarray(rows[believable(
             found, self.posterior, self.given.gate, fits, int(true), self.given.place[rows],
-            beside_refused(self.given.mates, refused, loops)[rows],
-            lambda: self._by_chance(rows))])
-
-    def _by_chance(self, rows: Indices) -> float:
-        """
-        Return the log ratio that all but `FALSE_PLACES` of false loops stay below.
-
-        They are some loops, (k,), whose second ends are exchanged at random: on a sphere, or in
-        any way that is alike everywhere, such fit far more often than if what they claim filled a
-        volume.
-        """
-        rows = rows[~self.given.factors.is_absolute[rows]]
-        # In an order of their own, in whatever order they came.
-        rows = rows[np.argsort(keys(self.given.low[rows], self.given.high[rows]), kind='stable')]
-        loops = self.subgraph(rows)
-        factors = loops.between
-        other = np.random.default_rng(0).permutation(factors.j)
-        some = np.flatnonzero(factors.i != other)
-        exchanged = loops.without_factors()
-        exchanged.append_between(factors.i[some], other[some], factors.measurement[some],
-                                 factors.sqrt_information[some])
-        found = innovations(exchanged, self.poses, self.posterior,
-                            claimed_volume(self.given.graph.manifold, self.poses))
-        log_ratio = found.log_ratio()[found.square < self.given.gate(found.freedom)]
-        rare = int(FALSE_PLACES * len(some))
-        return float(-np.sort(-log_ratio)[rare]) if rare < len(log_ratio) else -np.inf
+            beside_refused(self.given.mates, refused, loops)[rows])])
