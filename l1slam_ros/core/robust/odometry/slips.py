@@ -124,9 +124,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if state and evidence > most and (usual or (odds > 0 and len(steps) == 1)):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
-    if most < SURE:
-        runs_in, gain = _with_runs(growth)
-        found = runs_in if gain > most else found
+    found = found or _with_runs(growth)
     if not found and growth.cut.any():
         # In the end more is known than when it was cut.
         now = log_odds_of_slips(growth, motion)
@@ -135,9 +133,9 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     return found
 
 
-def _with_runs(growth: Growth) -> tuple[Growth | None, float]:
+def _with_runs(growth: Growth) -> Growth | None:
     """
-    Return a state with the runs left out that noisier odometry explains, or None; what it gains.
+    Return a state with the runs that are left out and noisier odometry explains, None: without.
 
     The noise is learnt of the loops that came in, which are those that it is small for: a robot
     that backs up, or slides on one floor, errs by more where nothing else looks. A run that is off
@@ -147,14 +145,14 @@ def _with_runs(growth: Growth) -> tuple[Growth | None, float]:
     rows, loops = growth.undecided(), growth.accepted & given.is_loop
     rows = rows[~np.isin(given.place[rows], given.place[loops])]
     if len(rows) < RUN or growth.ventured.any() or given.may_err_as_one(np.flatnonzero(loops)):
-        return None, 0.0
+        return None
     noisier = growth.copy()
     noisier.noise = replace(noise, variance=noise.variance * (_NOISIER, 1.0))
     noisier.solve()
     found = noisier.innovations(rows)
     groups = runs(growth, rows[found.square < given.gate(found.freedom)])
     if not groups:
-        return None, 0.0
+        return None
     state = growth.copy()
     for group in groups:
         state.accepted[group.rows] = state.ventured[group.rows] = True
@@ -166,7 +164,7 @@ def _with_runs(growth: Growth) -> tuple[Growth | None, float]:
         state.solve()
     _accept_more(state)
     is_noisier = state.noise.variance[0] > _MOST * min(growth.noise.first[0], 1.0)
-    return (None, 0.0) if is_noisier else (state, _gain(growth, growth, state))
+    return None if is_noisier or _gain(growth, growth, state) <= 0 else state
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
