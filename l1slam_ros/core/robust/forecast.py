@@ -25,9 +25,8 @@ from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
 # Of a map of which all is well; then for one without an accepted loop, each power of e by which it
 # is less sure of itself than a right one is exact, odometry that drifts, refused loops that
-# nothing speaks against though others are accepted, and a slip that is neither believed nor ruled
-# out.
-_WEIGHTS = np.array([-4.09, 5.68, 1.37, 3.39, 4.79, 4.21])
+# nothing speaks against, and a slip that is neither believed nor ruled out.
+_WEIGHTS = np.array([-4.32, 5.17, 1.41, 2.55, 3.86, 3.45])
 # Below, by how unsure it is alone, a map is doubtful.
 CONFIDENT = 0.9
 # A right map is off by so much at most: [m], or this part of its diagonal.
@@ -44,15 +43,15 @@ def forecast(terms: Array) -> float:
     return float(1 / (1 + np.exp(_WEIGHTS[:len(terms)] @ terms)))
 
 
-def terms_of(accepts_any: bool, unsure: float, drifts: bool, other: bool, slips: bool) -> Array:
+def terms_of(accepts_any: bool, unsure: float, *reasons: bool) -> Array:
     """
     Return what the weights are of, (6,).
 
-    accepts_any : whether any loop is accepted; unsure : see `unsureness`; drifts, other, slips :
-    whether odometry drifts, refused loops agree on another map, a slip is suspected
+    accepts_any : whether any loop is accepted; unsure : see `unsureness`; reasons : whether
+    odometry drifts, refused loops agree on another map, a slip is suspected
     """
-    return np.array([1.0, not accepts_any, np.log(max(unsure, _SUREST)), drifts,
-                     other and accepts_any, slips])
+    return np.array([1.0, not accepts_any, np.log(max(unsure, _SUREST)),
+                     *reasons])
 
 
 def right_within(positions: Array) -> float:
