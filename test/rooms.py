@@ -152,11 +152,12 @@ def write_log(path, scans, wheels):
     path.write_text('\n'.join(lines) + '\n')
 
 
-def write_scan_bag(path, scans, wheels, mount=None):
+def write_scan_bag(path, scans, wheels, mount=None, again=0):
     """
     Write scans, odometry twice as often and where the laser is, by an independent writer.
 
-    The recorder's clock goes on, whatever the stamps of the scans do.
+    The recorder's clock goes on, whatever the stamps of the scans do. again : so often odometry
+    comes again at the stamp of each scan
     """
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types
@@ -194,7 +195,8 @@ def write_scan_bag(path, scans, wheels, mount=None):
                     types['geometry_msgs/msg/Transform'](vector(x, y, z), quaternion(*q)))]))
         for k, (scan, pose) in enumerate(zip(scans, wheels, strict=True)):
             now = scans[0].stamp + k * int(_PERIOD * 1e9)
-            put('/wheels', now, odometry(scan.stamp, pose))
+            for _ in range(1 + again):
+                put('/wheels', now, odometry(scan.stamp, pose))
             put('/scan', now, types['sensor_msgs/msg/LaserScan'](
                 header(scan.stamp, 'laser'), scan.angle_min, 6.28, scan.angle_increment,
                 scan.time_increment, 0.2, scan.range_min, scan.range_max,

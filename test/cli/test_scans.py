@@ -121,6 +121,15 @@ def test_a_clock_that_is_set_back_within_a_bag_is_one_clock_again(drive, tmp_pat
     assert {**found, 'seconds': 0, 'warnings': []} == {**said, 'seconds': 0}
 
 
+def test_odometry_that_comes_twice_with_the_first_scan_is_used_once(drive, tmp_path):
+    scans, wheels = drive[0][:20], drive[1][:20]
+    once, twice = tmp_path / 'once', tmp_path / 'twice'
+    write_scan_bag(once, scans, wheels)
+    write_scan_bag(twice, scans, wheels, again=3)
+    expected, found = (read_bag_scans(bag, '/wheels', '/scan').wheels for bag in (once, twice))
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_the_scans_of_a_bag_bear_the_velocity_of_the_wheels_meanwhile(drive, tmp_path):
     scans, wheels = drive[0][:20], drive[1][:20]
     slow = [replace(scan, time_increment=0.2 / len(scan.ranges)) for scan in scans]

@@ -56,6 +56,8 @@ def read_bag_scans(path: Path, odom_topic: str, scan_topic: str) -> LaserLog:
                         f'{odom_topic}; expected 2 or more')
     stamps, scans, shifted = taken.in_order()
     rows = not_falling(stamps.tolist())
+    # Of messages with one stamp the first is used: nothing lies between them.
+    rows = rows[np.unique(stamps[rows], return_index=True)[1]]
     stamps, poses = stamps[rows], np.array(taken.poses)[rows]
     wheels, found = wheels_at(stamps, poses, np.array([scan.stamp for scan in scans]))
     if not len(found):
