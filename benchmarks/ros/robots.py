@@ -39,7 +39,8 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.running.backend import Backend, BackendOptions
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
-KEYFRAMES, TIMED, ROBOTS, SEEDS = 10_000, 500, 5, 5
+KEYFRAMES, TIMED = 10_000, 500
+ROBOTS, SEEDS = 5, 5
 # Keyframes with an update that is not timed: the first ones link what is compiled.
 _WARM = 10
 # An update as often as the node makes one, and no budget: what goes on behind is not waited for.

@@ -29,7 +29,9 @@ def begin(e, mu):
         large = (mu + root + abs(e[k])) / 2
         small = mu * (mu + root) / (2 * large)  # (mu + root - |e|) / 2 would cancel
         u[k], v[k] = (large, small) if e[k] >= 0 else (small, large)
-        s[k], t[k], y[k] = mu / u[k], mu / v[k], e[k] / (mu + root)
+        s[k] = mu / u[k]
+        t[k] = mu / v[k]
+        y[k] = e[k] / (mu + root)
     return new
 
 

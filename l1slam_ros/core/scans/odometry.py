@@ -171,9 +171,9 @@ class ScanOdometry:
         fits = covariance is not None and found.matched >= _MATCHED
         helps = covariance is not None and found.matched >= _FOUND
         if covariance is None:
-            pose, covariance = expected, predicted
             if self._is_beyond_wheels(expected):
-                expected, predicted = pose, covariance = self._told, self._untold
+                expected, predicted = self._told, self._untold
+            pose, covariance = expected, predicted
         agree = 1.0 if fits and found.matched >= _MUCH else self._free_space(pose, points)
         # Where rays look at nothing, they contradict nothing.
         if (fits and np.isnan(agree)) or (helps and agree >= _AGREE):

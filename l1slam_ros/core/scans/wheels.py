@@ -19,9 +19,11 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.points import Scan
 
-# A step is a jump if it goes further than this [m], faster than this [m/s], and so many times as
-# far as the robot went before: wheels that slip, or turn at once, do none.
-_FAR, _FAST, _TIMES = 1.0, 3.0, 5.0
+# A step is a jump if it goes further than this [m], and faster than this [m/s], and so many times
+# as far as the robot went before: wheels that slip, or turn at once, do none.
+_FAR = 1.0
+_FAST = 3.0
+_TIMES = 5.0
 
 
 class Wheels:

@@ -31,7 +31,8 @@ def began_anew(wheels, k):
 
 def followed(stamps, poses):
     """Return the poses of the way without jumps, and what was said of each."""
-    wheels, found, said = Wheels(), [], []
+    wheels = Wheels()
+    found, said = [], []
     for stamp, pose in zip(stamps.tolist(), poses, strict=True):
         said.append(wheels.follow(stamp, pose))
         found.append(wheels.pose)

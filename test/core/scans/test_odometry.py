@@ -109,7 +109,8 @@ def test_motion_within_a_scan_is_taken_out():
 def test_a_robot_that_begins_to_turn_while_it_scans():
     """What the wheels did before the scan says nothing of it; what they did meanwhile does."""
     rng = np.random.default_rng(0)
-    stand, turning, period = np.array([4.5, 1.2, 0.0]), np.array([0.0, 0.0, 1.5]), 0.2
+    stand, turning = np.array([4.5, 1.2, 0.0]), np.array([0.0, 0.0, 1.5])
+    period = 0.2
 
     def turned(velocity):
         front_end, last = ScanFrontEnd(), None
