@@ -265,8 +265,7 @@ class Keeper:
         if taken:
             with self._front_lock:
                 with self._graph_lock:
-                    front, state = self._front, self._state
-                    seen = Seen.of(self._builder)
+                    front, state, seen = self._front, self._state, Seen.of(self._builder)
                 ends = self._joins.ends(seen, state.table, state.optimised.poses, front)
                 with self._graph_lock:
                     if self._state.began == state.began:
