@@ -28,6 +28,8 @@ from environments import environment, own_variables
 
 import l1slam_ros
 from l1slam_ros.cli.main import main
+from l1slam_ros.core.kernels.kept import objects
+from l1slam_ros.io.compilation import STEPS
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / 'README.md'
@@ -341,15 +343,29 @@ def has_ros():
     return True
 
 
-def copied_package(folder):
-    """Copy the package, compiled loops and all, and put an `l1slam` of it into the path."""
-    shutil.copytree(ROOT / 'l1slam_ros', folder / 'l1slam_ros')
+def copied_package(folder, monkeypatch):
+    """
+    Copy the package, and put an `l1slam` of it into the path; return where its loops are kept.
+
+    What is compiled goes by the name of its place: copied under that of the copy, it is not
+    compiled once more.
+    """
+    shutil.copytree(ROOT / 'l1slam_ros', folder / 'l1slam_ros',
+                    ignore=shutil.ignore_patterns('__pycache__'))
+    compiled = {step: found[0] for step in STEPS if (found := objects.files(step))}
+    place = folder / 'compiled'
+    place.mkdir()
+    monkeypatch.setattr(objects, 'KERNELS', folder / 'l1slam_ros' / 'core' / 'kernels')
+    for step, path in compiled.items():
+        shutil.copy(path, place / objects.file_name(step))
+    monkeypatch.undo()
     (folder / 'bin').mkdir()
     command = folder / 'bin' / 'l1slam'
     command.write_text(
         f'#!/bin/sh\nPYTHONPATH={shlex.quote(str(folder))} exec {shlex.quote(sys.executable)} -c '
         '"import sys; from l1slam_ros.cli.main import main; sys.exit(main(sys.argv[1:]))" "$@"\n')
     command.chmod(0o755)
+    return place
 
 
 def carry_out(block, folder):
@@ -387,9 +403,10 @@ def assert_the_map_is_good(trials, folder, environment):
 
 @pytest.mark.parametrize('heading, said', [
     ('Add a norm', 'pseudo-huber'), ('Add a solver', 'newton'), ('Add an input', '.edges')])
-def test_a_recipe_carried_out_as_written_does_what_it_says(heading, said, tmp_path):
+def test_a_recipe_carried_out_as_written_does_what_it_says(
+        heading, said, tmp_path, monkeypatch):
     environment = room(tmp_path)
-    copied_package(tmp_path)
+    environment['NUMBA_CACHE_DIR'] = str(copied_package(tmp_path, monkeypatch))
     environment['PATH'] = f'{tmp_path / "bin"}:{environment["PATH"]}'
     ours = [block for block in blocks(RECIPES) if block.heading == heading]
     trials = [command for block in ours if block.language == 'sh'
