@@ -242,7 +242,8 @@ def test_what_is_said_of_one_of_each_is_in_the_singular(tmp_path):
 
 def test_a_name_with_a_line_break_in_it_is_told_in_one_line(capsys):
     assert main(['info', 'no\nsuch.g2o']) == 2
-    assert capsys.readouterr().err == 'l1slam: no\\nsuch.g2o: no such file or directory\n'
+    assert capsys.readouterr().err == (
+        'l1slam: no\\nsuch.g2o: no such file or directory; expected a graph, a bag or a log\n')
 
 
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='no device that is always full')
