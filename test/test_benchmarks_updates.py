@@ -18,13 +18,14 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core.geometry import se2, se3
-from l1slam_ros.paper.updates import Kept
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.paper.updates import Drive, Kept
 
 FOLDER = Path(__file__).parents[1] / 'benchmarks'
 sys.path.append(str(FOLDER))
-cells, tables, suite, kinds, cases, in_space = (importlib.import_module(name) for name in (
+cells, tables, suite, kinds, cases, in_space, waits = (importlib.import_module(name) for name in (
     'updates.cells', 'updates.tables', 'incremental', 'robust.kinds', 'robust.cases',
-    'updates.in_space'))
+    'updates.in_space', 'waits'))
 TINY = cells.Cell('world10k', 'random', 0.3, 100, 1e4)
 
 
@@ -55,6 +56,13 @@ def test_what_is_said_was_measured():
     record = json.loads((FOLDER / 'results' / 'incremental.json').read_text())
     lines = tables.document(record, [cells.Row.of(fields) for fields in record['rows']])
     assert (FOLDER / 'INCREMENTAL.md').read_text().splitlines() == lines
+
+
+def test_each_keyframe_of_a_drive_is_waited_for(rng):
+    world = simulate_world(120, 200, WorldOptions(), rng)
+    clock, processor = waits.measure(Drive.of(world.graph), 80, 2000.0)
+    assert len(clock) == len(processor) == 80
+    assert (clock > 0).all() and (processor > 0).all()
 
 
 def test_a_cell_is_measured_from_the_graph_to_the_row(tiny):

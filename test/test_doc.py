@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """README and doc/: links lead somewhere, commands and Python run, recipes are true."""
 
+import bz2
 import json
 import os
 import re
@@ -27,12 +28,17 @@ from environments import environment, own_variables
 
 import l1slam_ros
 from l1slam_ros.cli.main import main
+from l1slam_ros.core.kernels.kept import objects
+from l1slam_ros.io.compilation import STEPS
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / 'README.md'
 PAGES = [README, *sorted((ROOT / 'doc').glob('*.md'))]
 RECIPES = ROOT / 'doc' / 'how_to_change_it.md'
+DATASETS = ROOT.parent / 'shared' / 'datasets'
 MOST_WORDS, MOST_TERMS = 1200, 30
+# Part of a log of scans that the commands of a page map; test_scans.py maps all of it.
+OF_A_LOG = 0.4
 
 MINUTES = 'takes minutes; its options are held to its --help'
 PEERS = 'takes minutes, and other solvers from PyPI; its options are held to its --help'
@@ -182,16 +188,18 @@ BENCHMARKS = sorted({
     if command.startswith('python benchmarks/')})
 
 
-@pytest.mark.parametrize('command', BENCHMARKS)
-def test_a_benchmark_knows_the_options_that_a_page_gives_it(command):
-    _, script, *arguments = shlex.split(command)
+@pytest.mark.parametrize('script', sorted({command.split()[1] for command in BENCHMARKS}))
+def test_a_benchmark_knows_the_options_that_a_page_gives_it(script):
     helped = subprocess.run([sys.executable, script, '--help'], cwd=ROOT, capture_output=True,
                             text=True, timeout=120)
     assert helped.returncode == 0, helped.stderr
-    assert {word for word in arguments if word.startswith('--')} <= set(
-        re.findall(r'--[\w-]+', helped.stdout))
+    options = set(re.findall(r'--[\w-]+', helped.stdout))
     places = len(re.findall(r'^  [a-zA-Z]\w*', helped.stdout, re.M))
-    assert not arguments or arguments[0].startswith('--') or places
+    for command in BENCHMARKS:
+        _, named, *arguments = shlex.split(command)
+        if named == script:
+            assert {word for word in arguments if word.startswith('--')} <= options, command
+            assert not arguments or arguments[0].startswith('--') or places, command
 
 
 # What is `l1slam WORD ...` in a sentence or a table.
@@ -238,16 +246,42 @@ def test_every_section_with_figures_has_a_command():
     assert left == NOT_MEASURED.keys()
 
 
-def room(folder, package=ROOT):
-    """Return a folder like a fresh checkout, beside its own outputs, and what it is run with."""
+def room(folder):
+    """
+    Return a folder like a fresh checkout, beside its own outputs, and what it is run with.
+
+    Without the package, and with a Python that begins the running one: what is compiled is kept
+    by the paths of both, and by others all of it would be compiled once more.
+    """
     for entry in ROOT.iterdir():
         if entry.name not in ('.git', '.venv', 'demo', 'build', 'l1slam_ros'):
             (folder / entry.name).symlink_to(entry)
-    if package == ROOT:
-        (folder / 'l1slam_ros').symlink_to(ROOT / 'l1slam_ros')
-    (folder / '.venv').symlink_to(sys.prefix)
-    return {**os.environ, 'PATH': f'{folder / ".venv" / "bin"}:{os.environ["PATH"]}',
-            'DATASETS': str(ROOT.parent / 'shared' / 'datasets')}
+    programs = folder / '.venv' / 'bin'
+    programs.mkdir(parents=True)
+    for entry in (Path(sys.prefix) / 'bin').iterdir():
+        if not entry.name.startswith('python'):
+            (programs / entry.name).symlink_to(entry)
+    python = programs / 'python'
+    python.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n')
+    python.chmod(0o755)
+    return {**os.environ, 'PATH': f'{programs}:{os.environ["PATH"]}', 'DATASETS': str(DATASETS)}
+
+
+@pytest.fixture(scope='module')
+def shorter(tmp_path_factory):
+    """Return the datasets with the first part of each log of scans, or what is in their place."""
+    if not DATASETS.exists():
+        return DATASETS
+    folder = tmp_path_factory.mktemp('shorter') / 'datasets'
+    for entry in (*DATASETS.iterdir(), *(DATASETS / 'lidar').iterdir()):
+        place = folder / entry.relative_to(DATASETS)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if entry.name == 'fr079.clf.bz2':
+            lines = bz2.decompress(entry.read_bytes()).splitlines(keepends=True)
+            place.write_bytes(bz2.compress(b''.join(lines[:int(OF_A_LOG * len(lines))])))
+        elif entry.name != 'lidar':
+            place.symlink_to(entry)
+    return folder
 
 
 def run(command, folder, environment, codes=(0,)):
@@ -280,8 +314,8 @@ def backend(command, folder, environment):
 
 
 @pytest.mark.parametrize('page', [page for page in PAGES if page != RECIPES], ids=of_page)
-def test_the_commands_of_a_page_run_in_their_order(page, tmp_path):
-    environment, nodes = room(tmp_path), []
+def test_the_commands_of_a_page_run_in_their_order(page, tmp_path, shorter):
+    environment, nodes = {**room(tmp_path), 'DATASETS': str(shorter)}, []
     for block in blocks(page):
         if block.language == 'python':
             run(f'{shlex.quote(sys.executable)} -c {shlex.quote(block.text)}', tmp_path,
@@ -309,15 +343,29 @@ def has_ros():
     return True
 
 
-def copied_package(folder):
-    """Copy the package, compiled loops and all, and put an `l1slam` of it into the path."""
-    shutil.copytree(ROOT / 'l1slam_ros', folder / 'l1slam_ros')
+def copied_package(folder, monkeypatch):
+    """
+    Copy the package, and put an `l1slam` of it into the path; return where its loops are kept.
+
+    What is compiled goes by the name of its place: copied under that of the copy, it is not
+    compiled once more.
+    """
+    shutil.copytree(ROOT / 'l1slam_ros', folder / 'l1slam_ros',
+                    ignore=shutil.ignore_patterns('__pycache__'))
+    compiled = {step: found[0] for step in STEPS if (found := objects.files(step))}
+    place = folder / 'compiled'
+    place.mkdir()
+    monkeypatch.setattr(objects, 'KERNELS', folder / 'l1slam_ros' / 'core' / 'kernels')
+    for step, path in compiled.items():
+        shutil.copy(path, place / objects.file_name(step))
+    monkeypatch.undo()
     (folder / 'bin').mkdir()
     command = folder / 'bin' / 'l1slam'
     command.write_text(
         f'#!/bin/sh\nPYTHONPATH={shlex.quote(str(folder))} exec {shlex.quote(sys.executable)} -c '
         '"import sys; from l1slam_ros.cli.main import main; sys.exit(main(sys.argv[1:]))" "$@"\n')
     command.chmod(0o755)
+    return place
 
 
 def carry_out(block, folder):
@@ -355,9 +403,10 @@ def assert_the_map_is_good(trials, folder, environment):
 
 @pytest.mark.parametrize('heading, said', [
     ('Add a norm', 'pseudo-huber'), ('Add a solver', 'newton'), ('Add an input', '.edges')])
-def test_a_recipe_carried_out_as_written_does_what_it_says(heading, said, tmp_path):
-    environment = room(tmp_path, package=None)
-    copied_package(tmp_path)
+def test_a_recipe_carried_out_as_written_does_what_it_says(
+        heading, said, tmp_path, monkeypatch):
+    environment = room(tmp_path)
+    environment['NUMBA_CACHE_DIR'] = str(copied_package(tmp_path, monkeypatch))
     environment['PATH'] = f'{tmp_path / "bin"}:{environment["PATH"]}'
     ours = [block for block in blocks(RECIPES) if block.heading == heading]
     trials = [command for block in ours if block.language == 'sh'

@@ -85,7 +85,7 @@ def read(arguments: argparse.Namespace, path: Path, quiet: bool = False) -> Grap
         record = read_scan_map(arguments, path, quiet).record
         warn(record.skipped, quiet)
         return record
-    topics = Topics(arguments.odom_topic, arguments.loop_topic)
+    topics = Topics(arguments.odom_topic, arguments.loop_topic, with_loops=False)
     record = formats.read_input(path, options, topics, arguments.rotation_information,
                                 options.dimension if options else 2)
     warn(record.skipped, quiet)

@@ -14,7 +14,6 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from l1slam_ros.cli.fleet_options import add_batch, add_merge
 from l1slam_ros.core import names
 from l1slam_ros.core.errors import L1SlamError, optional_libraries
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
-from l1slam_ros.io.progress import say
+from l1slam_ros.io.progress import forget, say
 from l1slam_ros.paper import printed as paper
 
 BAD_INPUT = 2
@@ -74,10 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if sys.stdout is not None:
                 sys.stdout.flush()
     except BrokenPipeError:
-        _forget_output()
+        forget(sys.stdout)
         return BROKEN_PIPE
     except OSError as error:
-        _forget_output()
+        forget(sys.stdout)
         what = error.strerror or str(error)
         return _refuse(what if error.filename is None else f'{error.filename}: {what}')
     except L1SlamError as error:
@@ -125,12 +124,6 @@ def _run(options: argparse.Namespace) -> Any:
 def _refuse(sentence: str) -> int:
     say(sentence)
     return BAD_INPUT
-
-
-def _forget_output() -> None:
-    """Let Python not fail again on what nobody can read when it ends."""
-    with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _add_force(parser: argparse.ArgumentParser) -> None:

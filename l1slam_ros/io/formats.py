@@ -107,7 +107,7 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
 
     """
     if not path.exists():
-        raise FileError(path, 'no such file or directory')
+        raise FileError(path, 'no such file or directory; expected a graph, a bag or a log')
     if is_bag(path):
         with optional_libraries():
             from l1slam_ros.io.bags.to_graph import graph_from_bag

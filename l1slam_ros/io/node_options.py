@@ -33,8 +33,7 @@ class UpdateOptions(Options):
     """How often the node updates the map, and how long an update may take."""
 
     period: float = option(
-        0.2, 'time from the begin of one update to the begin of the next', 's', 1e-3, 3600,
-        fixed=True)
+        0.2, 'time from the begin of one update to the begin of the next', 's', 1e-3, 3600)
     budget: float = option(0.1, 'longest time that one update may take', 's', 1e-3, 3600)
 
 
@@ -54,7 +53,7 @@ class NodeOptions(BackendOptions):
     publish_tf: bool = option(
         True, 'publish map -> odom on /tf, where tf2_msgs is installed', fixed=True)
     transform_period: float = option(
-        0.05, 'time between two publications of map -> odom', 's', 1e-3, 3600, fixed=True)
+        0.05, 'time between two publications of map -> odom', 's', 1e-3, 3600)
     transform_tolerance: float = option(
         0.1, 'how far, at least, map -> odom is stamped ahead of the newest odometry; odometry '
         'with a long period is stamped further ahead', 's', 0, 3600)

@@ -8,20 +8,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """Progress on standard error: a bar on a terminal, in a log a line now and then."""
 
+import os
 import sys
 import time
 from contextlib import suppress
 from types import TracebackType
-from typing import Any
+from typing import Any, TextIO
 
 # [s] What takes less is not worth a line in a log; the next ones are so far apart.
 _PATIENCE, _APART = 3.0, 5.0
 
 
 def say(sentence: str) -> None:
-    """Print a line to standard error, which may have been closed."""
-    with suppress(BrokenPipeError):
-        print(f'l1slam: {sentence}', file=sys.stderr, flush=True)
+    """Print one line to standard error, which may be closed, or a file on a full disk."""
+    if sys.stderr is None:  # `print` would take standard output, where JSON may be
+        return
+    line = sentence.replace('\n', '\\n')  # the name of a file may have one in it
+    try:
+        print(f'l1slam: {line}', file=sys.stderr, flush=True)
+    except OSError:
+        forget(sys.stderr)
+
+
+def forget(stream: TextIO) -> None:
+    """Let Python not fail again on what nobody can read when it ends."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 class Progress:

@@ -69,8 +69,7 @@ class BackendNode(LifecycleNode):
 
     def __init__(self, **keywords: Any):
         super().__init__('backend', **keywords)
-        self._declared = NodeParameters(
-            self, NodeOptions(), lambda options: self._backend.set_options(options))
+        self._declared = NodeParameters(self, NodeOptions(), self._on_change)
         options = self.options
         measure_by(free_memory)
         self._backend = Backend(options, options.dimension)
@@ -173,6 +172,11 @@ class BackendNode(LifecycleNode):
     def is_saving(self) -> bool:
         """Return whether the map is being saved."""
         return self._map_services.is_saving()
+
+    def _on_change(self, options: NodeOptions) -> None:
+        """Take new options; the next update, for which it may have been long, is now."""
+        self._backend.set_options(options)
+        self._solver.hurry()
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuse a `save_path` that cannot be written; at start its folder may be missing."""

@@ -45,10 +45,12 @@ class NodeParameters(Generic[AnyOptions]):
     def __init__(self, node: Node, defaults: AnyOptions,
                  on_change: Callable[[AnyOptions], None]):
         self._node, self._on_change = node, on_change
+        # To ROS an empty list has no type and is no value: it stands for the default.
+        empty = {name for name, one in node._parameter_overrides.items() if one.value is None}
         try:
             given = {name: node.declare_parameter(
                 name, list(value) if isinstance(value, tuple) else value,
-                _descriptor(value, meaning)).value
+                _descriptor(value, meaning), ignore_override=name in empty).value
                      for name, (value, meaning) in flatten(defaults).items()}
         except ParameterException as error:
             raise OptionError(str(error)) from error

@@ -149,6 +149,8 @@ class RobotPublisher:
         robot, now = self._look(), time.monotonic()
         if robot is None or robot.stamp == self._before:
             return math.inf
+        # The period may have been shortened.
+        self._due = min(self._due, now + self._parameters.options.transform_period)
         if now >= self._due or robot.stamp > self._stamp:
             self._publish(robot)
         return self._due - now

@@ -238,3 +238,24 @@ def test_what_is_said_of_one_of_each_is_in_the_singular(tmp_path):
     for word in ('block products', 'did not converge', 'nan', '1 loops', '1 iterations'):
         assert word not in said
     assert json.loads(l1slam('solve', path, '--json').stdout)['loops'] == 1
+
+
+def test_a_name_with_a_line_break_in_it_is_told_in_one_line(capsys):
+    assert main(['info', 'no\nsuch.g2o']) == 2
+    assert capsys.readouterr().err == (
+        'l1slam: no\\nsuch.g2o: no such file or directory; expected a graph, a bag or a log\n')
+
+
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='no device that is always full')
+def test_a_sentence_for_which_there_is_no_room_changes_no_exit_code(tmp_path):
+    with open('/dev/full', 'w') as full:
+        ended = l1slam('info', 'no.g2o', cwd=tmp_path, capture_output=False, stderr=full)
+    assert ended.returncode == 2
+
+
+def test_without_standard_error_nothing_is_mixed_into_the_json(graph):
+    graph.write_text(graph.read_text() + 'EDGE_SE2 3 3 0 0 0 100 0 0 100 0 900\n')
+    shell = ['sh', '-c', '"$@" 2>&-', 'sh', sys.executable, '-c', RUN, 'solve', graph, '--json']
+    ended = subprocess.run(shell, timeout=DEADLINE, stdout=subprocess.PIPE, text=True)
+    assert ended.returncode == 0
+    assert 'itself' in json.loads(ended.stdout)['warnings'][0]

@@ -63,14 +63,14 @@ OF_ROS = 'lifecycle_msgs/', 'rcl_interfaces/', 'type_description_interfaces/'
 # name -> default, unit; those that only the start can set are marked.
 PARAMETERS = {
     'map_frame': ('map', '', True), 'odom_frame': ('odom', '', True), 'base_frame': ('', '', True),
-    'update.period': (0.2, 's', True), 'update.budget': (0.1, 's', False),
+    'update.period': (0.2, 's', False), 'update.budget': (0.1, 's', False),
     'keyframe.translation': (0.5, 'm', False), 'keyframe.rotation': (0.2, 'rad', False),
     'keyframe.period': (0.0, 's', False), 'odometry.covariance_source': ('model', '', False),
     'odometry.sigma_translation': (0.05, 'm/m', False),
     'odometry.sigma_rotation': (0.05, 'rad/rad', False),
     'loop.covariance_source': ('message', '', False), 'loop.wait': (10.0, 's', False),
     'robust.enabled': (True, '', False), 'dimension': (2, '', True),
-    'publish_tf': (True, '', True), 'transform_period': (0.05, 's', True),
+    'publish_tf': (True, '', True), 'transform_period': (0.05, 's', False),
     'transform_tolerance': (0.1, 's', False), 'save_path': ('', '', False),
     'on_time_jump': ('new_segment', '', False), 'autostart': (True, '', True),
 }

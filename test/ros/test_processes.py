@@ -92,7 +92,7 @@ def paths(ros):
 
 
 def test_replay_plays_a_bag_into_backend_and_a_map_comes_out(backend, bag, paths):
-    played = replay(bag, '--rate', '10')
+    played = replay(bag, '--rate', '40')
     assert (played.returncode, complaints(played)) == (0, [])
     path = paths(lambda path: len(path.poses) == 200)
     assert path.header.frame_id == 'map'
@@ -103,7 +103,7 @@ def test_replay_plays_a_bag_into_backend_and_a_map_comes_out(backend, bag, paths
 
 
 def test_a_part_of_a_bag_on_other_topics(backend, bag, paths):
-    played = replay(bag, '--rate', '10', '--start', '5', '--duration', '10',
+    played = replay(bag, '--rate', '40', '--start', '5', '--duration', '10',
                     '--topics', '/odom', '--remap', '/odom:=/other', '--wait', '0')
     assert played.returncode == 0
     played = replay(bag, '--rate', '10', '--start', '2', '--duration', '3', '--topics', '/odom')
@@ -129,7 +129,7 @@ def test_services_are_answered_when_they_are_done(backend, ros):
 
 
 def test_replay_waits_for_subscribers_and_loses_neither_the_first_nor_the_last(bag, ros):
-    with waiting_replay(bag, '--rate', '20') as process:
+    with waiting_replay(bag, '--rate', '40') as process:
         node, heard = ros.create_node('late'), Counter()
         for kind, topic in (Odometry, '/odom'), (PoseWithCovarianceStamped, '/loop_closures'):
             node.create_subscription(
@@ -145,7 +145,7 @@ def test_replay_waits_for_subscribers_and_loses_neither_the_first_nor_the_last(b
 
 def test_replay_waits_for_the_nodes_that_it_is_told_of(bag, ros):
     """Another node has a subscription to each topic long before."""
-    with waiting_replay(bag, '--rate', '20', '--nodes', 'late', whom='late') as process:
+    with waiting_replay(bag, '--rate', '40', '--nodes', 'late', whom='late') as process:
         other, late = ros.create_node('other'), ros.create_node('late')
         heard = {node.get_name(): [] for node in (other, late)}
 
@@ -186,10 +186,10 @@ def test_replay_plays_to_nobody_after_as_long_as_it_is_told(bag, seconds, said):
     assert [line.split(': ')[-1] for line in played.stderr.splitlines()] == said
 
 
-def test_replay_is_paced(backend, bag):
+def test_replay_is_paced(bag):
     began = time.monotonic()
-    assert replay(bag, '--rate', '5', '--duration', '10').returncode == 0
-    assert time.monotonic() - began >= 2.0
+    assert replay(bag, '--rate', '10', '--duration', '10', '--wait', '0').returncode == 0
+    assert time.monotonic() - began >= 1.0
 
 
 @pytest.mark.parametrize('arguments, complaint', [
@@ -207,7 +207,7 @@ def test_replay_of_a_damaged_bag_plays_a_part_says_so_and_exits_with_3(backend, 
     file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
     odometry = sum(message.topic == '/odom' for message in read_raw(file, None, lambda _: None))
     assert 50 < odometry < 150
-    played = replay(bag, '--rate', '10')
+    played = replay(bag, '--rate', '40')
     assert played.returncode == 3
     (complaint,) = complaints(played)
     assert re.fullmatch(rf'replay: {file} is damaged: it breaks off after [0-9,]+ bytes; '

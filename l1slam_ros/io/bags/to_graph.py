@@ -106,11 +106,14 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
             'expected 2 or more',
             *_alternatives(path, topics.odometry, ODOMETRY_TYPE, *LOOP_TYPES),
             *record.skipped, *damage]))
+    lost = growing.lost(path)
     for topic in sorted(topics.types().keys() - DEFAULT_TOPICS.types().keys() - growing.seen):
-        raise FileError(path, '; '.join([
-            f'no messages on {topic}; expected {topics.types()[topic]}',
-            *_alternatives(path, topic, topics.types()[topic]), *damage]))
-    return replace(record, damage='; '.join([*damage, *growing.lost(path)]))
+        if topics.with_loops or not lost:
+            raise FileError(path, '; '.join([
+                f'no messages on {topic}; expected {topics.types()[topic]}',
+                *_alternatives(path, topic, topics.types()[topic]), *damage]))
+        lost = [f'no messages on {topic}', *lost]
+    return replace(record, damage='; '.join([*damage, *lost]))
 
 
 class _Growing:
@@ -136,7 +139,8 @@ class _Growing:
             if self._foreign and self._foreign.topics.get(topic) == message.msgtype:
                 self._add_graph(message.data, topic)
                 return
-            if topic in (self._topics.loops, TRUSTED_LOOP_TOPIC):
+            if topic != self._topics.odometry and topic in (self._topics.loops,
+                                                            TRUSTED_LOOP_TOPIC):
                 self._loops.came[topic] += 1
             if message.msgtype != expected:
                 raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')

@@ -28,10 +28,16 @@ SCAN_TYPE = 'sensor_msgs/msg/LaserScan'
 
 @dataclass(frozen=True)
 class Topics:
-    """The topics of a bag's odometry and loop closures; its other topics have fixed names."""
+    """
+    The topics of a bag's odometry and loop closures; its other topics have fixed names.
+
+    with_loops : whether it is an error that another topic than the default is named for the loops
+    and has none while another one has; else that is damage of the bag, and the rest is read
+    """
 
     odometry: str = ODOMETRY_TOPIC
     loops: str = LOOP_TOPIC
+    with_loops: bool = True
 
     def types(self) -> dict[str, str]:
         """Return the topics with the types of their messages."""

@@ -138,6 +138,8 @@ def _entry(name: str, meaning: str) -> str:
 
 def _shown(value: Scalar) -> str:
     """Return a value as it is written after `-p name:=`."""
+    if isinstance(value, tuple):
+        return repr(list(value))
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 

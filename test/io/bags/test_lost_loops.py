@@ -75,6 +75,21 @@ def test_loops_on_another_topic_are_named_with_what_reads_them(capsys, tmp_path,
         read_graph(written(tmp_path, renamed(recording, loop_closures='/loops')))
 
 
+@pytest.mark.parametrize('named, said', [('/nope', 'no messages on /nope; '), ('/odom', '')])
+def test_a_wrong_topic_for_the_loops_is_solved_and_said(capsys, tmp_path, recording, named, said):
+    path = written(tmp_path, recording)
+    for command in ('solve', 'info', 'convert'):
+        to = [tmp_path / f'{command}.g2o'] if command == 'convert' else []
+        assert run(capsys, command, path, *to, '--loop-topic', named, code=3)[1] == (
+            f'l1slam: {said}no loop is in the map, but there are loops in 82 messages on '
+            '/loop_closures; expected --loop-topic /loop_closures\n')
+
+
+def test_a_wrong_topic_where_no_topic_has_loops_is_an_error(capsys, tmp_path, recording):
+    path = written(tmp_path, [one for one in recording if one[0] == '/odom'])
+    assert 'no messages on /nope' in run(capsys, 'info', path, '--loop-topic', '/nope', code=2)[1]
+
+
 def test_of_several_robots_each_is_named_with_its_odometry_and_one_that_is_read_will_do(
         tmp_path, recording):
     robots = [renamed(recording, odom=f'/r{k}/odom', loop_closures=f'/r{k}/loops')

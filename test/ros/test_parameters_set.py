@@ -1,0 +1,64 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the node that are set while it runs, and lists that are empty."""
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from node_bench import call
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+
+from l1slam_ros.io.node_options import NodeOptions
+from l1slam_ros.ros.shell.arguments import help_of
+
+
+def put(b, name, value):
+    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+    (result,) = call(b, 'set_parameters', request, SetParameters).results
+    return result.successful
+
+
+def test_a_shorter_period_of_the_updates_holds_at_once(bench):
+    b = bench(**{'update.period': 3600.0})
+    b.drive(0, 3)
+    b.until(lambda: b.received['pose'], 'odometry is used')
+    assert put(b, 'update.period', 0.05)
+    b.until(lambda: len(b.path().poses) == 3, 'the map is updated')
+    b.drive(3, 6)
+    b.until(lambda: len(b.path().poses) == 6, 'it is updated again')
+
+
+def test_a_shorter_period_of_the_transform_holds_from_the_next_odometry_on(bench):
+    b = bench(transform_period=3600.0)
+    b.drive(0, 1)
+    b.until(lambda: b.received['map_to_odom'], 'the transform is published')
+    assert put(b, 'transform_period', 0.05)
+    b.drive(1, 2)
+    count = len(b.received['map_to_odom'])
+    b.until(lambda: len(b.received['map_to_odom']) > count + 4, 'it is published again and again')
+
+
+@pytest.mark.parametrize('name, value', [
+    ('update.period', 0.0), ('update.period', float('nan')), ('transform_period', -1.0)])
+def test_a_period_that_is_none_is_refused(bench, name, value):
+    assert not put(bench(), name, value)
+
+
+def test_an_empty_list_of_robots_is_the_default(bench):
+    """To ROS it has no type: it comes as no value at all."""
+    b = bench(robots=[])
+    assert b.backend.options.robots == NodeOptions().robots
+    b.drive(0, 2)
+    b.until(lambda: len(b.path().poses) == 2, 'a single robot has its map')
+
+
+def test_help_shows_a_list_as_it_is_written():
+    assert "robots: ['']" in help_of('backend', NodeOptions())
