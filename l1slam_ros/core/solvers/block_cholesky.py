@@ -222,15 +222,15 @@ class BlockCholesky:
         """
         Factor J'WJ + diag(diagonal) + share C; False: it is not positive definite.
 
-        weights : (rows,); diagonal : (columns,) or one number; curvature : (m, 2 k, 2 k) of each
-        factor, C their sum
+        weights : (rows,); diagonal : (columns,) or one number; curvature : (m, 2, r, 2 k) of
+        each factor, as `Manifold.residual_curvature` has it, C their sum
         """
         k = system.block_size
         layout = self._layouts.get(k)
         if layout is None:
             layout = self._layouts[k] = _Layout(self.pattern, self._keyframe, k)
         if curvature is None or not share:
-            curvature = np.empty((0, 2 * k, 2 * k))
+            curvature = np.empty((0, 2, 0, 2 * k))
         added = np.full(system.size * k, diagonal, float).reshape(-1, k)
         if len(self._loose):
             own = system.diagonal(weights).reshape(-1, k)[self._loose]
