@@ -115,7 +115,7 @@ def test_the_memory_of_the_factor_is_predicted_to_a_third(rng):
 
 
 def test_the_time_is_predicted_by_factors_by_fill_and_by_work(rng):
-    """More of each takes longer; a graph with ten times the factors takes less than thrice that."""
+    """More of each takes longer; ten times the factors, less than thrice as long."""
     sparse, crowded = (simulate_world(600, edges, WorldOptions(), rng).graph
                        for edges in (1200, 12000))
     blocks, work = 10_000, 300_000.0
