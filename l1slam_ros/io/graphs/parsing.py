@@ -14,6 +14,7 @@ conversion fails is the malformed line searched for, to be named.
 """
 
 import warnings
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def refuse_quaternions(path: object, quaternions: Array, numbers: list[int]) -> 
 def _convert(texts: list[str], dtype: np.dtype) -> np.ndarray | None:
     """Return the rows as a structured array, or None if any of them is malformed."""
     end = _shared_end(texts, dtype['values'].shape[0])
-    rows = _with_end(texts, end, dtype) if end else _numbers(texts, dtype)
+    rows = _with_end(texts, end, dtype) if end else _numbers(texts, len(texts), dtype)
     # Written so that NaN fails, too.
     if rows is None or not (np.abs(rows['values']) <= LARGEST).all():
         return None
@@ -96,8 +97,8 @@ def _with_end(texts: list[str], end: list[str], dtype: np.dtype) -> np.ndarray |
     before = dtype['values'].shape[0] - len(end)
     short = np.dtype([('ids', dtype['ids']), ('values', np.float64, (before,))])
     length = len(_tail(end))
-    heads = _numbers([text[:-length] for text in texts], short)
-    shared = _numbers([_tail(end)], np.dtype([('values', np.float64, (len(end),))]))
+    heads = _numbers((text[:-length] for text in texts), len(texts), short)
+    shared = _numbers([_tail(end)], 1, np.dtype([('values', np.float64, (len(end),))]))
     if heads is None or shared is None:
         return None
     rows = np.empty(len(texts), dtype)
@@ -107,9 +108,9 @@ def _with_end(texts: list[str], end: list[str], dtype: np.dtype) -> np.ndarray |
     return rows
 
 
-def _numbers(texts: list[str], dtype: np.dtype) -> np.ndarray | None:
-    """Return the rows as a structured array, or None if any of them has other fields."""
-    if not texts:
+def _numbers(texts: Iterable[str], count: int, dtype: np.dtype) -> np.ndarray | None:
+    """Return `count` rows as a structured array, or None if any of them has other fields."""
+    if not count:
         return np.empty(0, dtype)
     with warnings.catch_warnings():
         # NumPy only warns about missing data and, before 2.0, about an id such as 1.5.
@@ -119,7 +120,7 @@ def _numbers(texts: list[str], dtype: np.dtype) -> np.ndarray | None:
         except (ValueError, Warning):
             return None
     # `loadtxt` skips rows without any field.
-    return rows if len(rows) == len(texts) else None
+    return rows if len(rows) == count else None
 
 
 def _complaint(text: str, ids: int, values: int) -> str:
@@ -128,10 +129,10 @@ def _complaint(text: str, ids: int, values: int) -> str:
     if len(fields) != ids + values:
         return counted(len(fields), 'field')
     for field in fields[:ids]:
-        if _numbers([field], np.dtype([('values', np.int64, (1,))])) is None:
+        if _numbers([field], 1, np.dtype([('values', np.int64, (1,))])) is None:
             return f'{quoted(field)} is not a whole number of 64 bits'
     for field in fields[ids:]:
-        number = _numbers([field], np.dtype([('values', np.float64, (1,))]))
+        number = _numbers([field], 1, np.dtype([('values', np.float64, (1,))]))
         if number is None or not np.isfinite(number['values']).all():
             return f'{quoted(field)} is not a finite number'
         if np.abs(number['values']) > LARGEST:

@@ -93,7 +93,7 @@ def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
         group = groups.setdefault(tag, TextLines([], []))
         end = begin + _alike(texts, begin, f'{tag} ')
         if end > begin:
-            group.texts.extend(text[len(tag):].lstrip() for text in texts[begin:end])
+            group.texts.extend(text[len(tag) + 1:].lstrip() for text in texts[begin:end])
         else:  # other whitespace beside the tag
             end = begin + 1
             group.texts.append(''.join(behind))
