@@ -45,8 +45,9 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
 
     keyframe : (m, 2), blocks : (m, 2, k, k), see `LinearSystem`; weights : (m, k); diagonal :
     (n, k)
-    curvature : (m', 2, r, 2 k) of the first m' factors, of each the rows of the last r entries of
-        keyframe i, and of j, which are its columns, too; all else is zero. C is their sum
+    curvature : (m', 2, k // 2, 2 k) of the first m' factors, of each the rows of the turns, the
+        last entries, of keyframe i, and of j, which are its columns, too; all else is zero. C is
+        their sum
     address, width : (m,) where the block between the keyframes i and j of each factor lies, and
     the stride of its panel; address -1: there is none
     turned : (m,) bool, that block is the one of row i and column j
@@ -54,7 +55,9 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
 
     Returns the sum of what it read ahead, which is of no use.
     """
-    k, still = len(size), len(size) - curvature.shape[2]
+    # Of three and of six numbers a step turns by one and by three. A number that is known when the
+    # loop is compiled; it is not asked of `curvature`, for that takes longer.
+    k, still = len(size), len(size) - len(size) // 2
     for at in range(len(panels)):
         panels[at] = 0.0
     # Keyframes' own blocks are summed up side by side: in the panels they lie far apart, and each

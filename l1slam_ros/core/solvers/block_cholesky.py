@@ -228,7 +228,7 @@ class BlockCholesky:
         if layout is None:
             layout = self._layouts[k] = _Layout(self.pattern, self._keyframe, k)
         if curvature is None or not share:
-            curvature = np.empty((0, 2, 0, 2 * k))
+            curvature = np.empty((0, 2, k // 2, 2 * k))
         added = np.full(system.size * k, diagonal, float).reshape(-1, k)
         if len(self._loose):
             own = system.diagonal(weights).reshape(-1, k)[self._loose]
