@@ -17,7 +17,6 @@ call knows, without importing numba, that nothing is to be done. The note is val
 Python, numba and processor with which it was made, as long as the files it names exist.
 """
 
-import ctypes
 import gc
 import hashlib
 import json
@@ -56,11 +55,6 @@ _STEPS_EACH = 3
 _LOOK = 0.1
 # [s] How long a process waits for another one that compiles the same step.
 _PATIENCE = 60.0
-# Options of glibc's `mallopt`: the size from which an array gets pages of its own, and how much
-# may lie free at the end of a heap. By default glibc raises both, to tens of megabytes a thread.
-_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
-# [bytes] From this size on NumPy asks for huge pages: fresh ones cost as little as reused ones.
-_HUGE = 2**22
 # Niceness of the compiling processes: low, because somebody waits for them.
 _NICE = 5
 
@@ -182,16 +176,12 @@ def alone(step: str) -> Iterator[None]:
 
 
 def load(steps: Sequence[str] = STEPS) -> None:
-    """Load the compiled loops of some steps, and prepare the memory of a process with a map."""
+    """Load the compiled loops of some steps, which stay: no search for garbage looks at them."""
     for step in steps:
         make_ready(step)
     # Some 100,000 objects stay; each search of them for garbage would take a tenth of a second.
     gc.collect()
     gc.freeze()
-    with suppress(AttributeError, OSError):  # another C library
-        ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _HUGE)
-        # The ratio that glibc itself keeps between the two.
-        ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, 2 * _HUGE)
 
 
 def make_ready(step: str) -> None:

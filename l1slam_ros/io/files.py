@@ -6,21 +6,15 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""
-Functions for text files: read lines of numbers, write a file whole or not at all.
-
-Numbers are converted in bulk, so a graph of 700,000 edges is read in seconds. Only when the
-conversion fails is the malformed line searched for, to be named.
-"""
+"""Functions for text files: read their lines, write a file whole or not at all."""
 
 import os
 import secrets
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 
@@ -28,7 +22,6 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.graph.measurements import QUATERNION_NORM_ERROR
 from l1slam_ros.io.bounded import read_text
 from l1slam_ros.io.remarks import Remarks, read_remarks
 
@@ -154,9 +147,12 @@ def formatted(line: str, *columns: np.ndarray) -> list[str]:
     To format many lines at once takes a third less time than one by one. A larger number would
     hold Python's lock for too long.
     """
-    parts = (np.concatenate([table[k : k + _AT_ONCE].astype(object) for table in columns], axis=1)
-             for k in range(0, len(columns[0]), _AT_ONCE))
-    return ['\n'.join([line] * len(part)) % tuple(part.ravel().tolist()) for part in parts]
+    texts = []
+    for k in range(0, len(columns[0]), _AT_ONCE):
+        part = [column.tolist() for table in columns for column in table[k:k + _AT_ONCE].T]
+        rows = zip(*part, strict=True)
+        texts.append('\n'.join([line] * len(part[0])) % tuple(chain.from_iterable(rows)))
+    return texts
 
 
 def write_lines(path: str | os.PathLike[str], lines: Iterable[str]) -> None:
@@ -192,10 +188,14 @@ def read_lines(path: str | os.PathLike[str]) -> TextLines:
     lines = text.split('\n')
     blank = [k for k, line in enumerate(lines) if not line or line.isspace()]
     comments = [k for k, line in enumerate(lines) if '#' in line and line.lstrip()[0] == '#']
-    apart = {*blank, *comments}
-    kept = [k for k in range(len(lines)) if k not in apart]
-    return TextLines([k + 1 for k in kept], [lines[k] for k in kept], remarks,
-                     tuple((k + 1, lines[k]) for k in comments))
+    numbers: list[int] = []
+    kept: list[str] = []
+    begin = 0
+    for k in [*sorted({*blank, *comments}), len(lines)]:
+        numbers += range(begin + 1, k + 1)
+        kept += lines[begin:k]
+        begin = k + 1
+    return TextLines(numbers, kept, remarks, tuple((k + 1, lines[k]) for k in comments))
 
 
 def counted(count: int, noun: str, plural: str = '') -> str:
@@ -206,41 +206,6 @@ def counted(count: int, noun: str, plural: str = '') -> str:
 def quoted(text: str) -> str:
     """Return a piece of a file as it is quoted in errors: printable, on one line, shortened."""
     return repr(text if len(text) <= _QUOTED else text[:_QUOTED] + '...')
-
-
-def parse_rows(path: object, name: str, lines: TextLines, ids: int,
-               values: int) -> tuple[Indices, Array]:
-    """
-    Convert lines of `ids` whole numbers followed by `values` finite numbers, none beyond 1e30.
-
-    Returns
-    -------
-    ids (m, ids) and values (m, values).
-
-    Raises
-    ------
-    FileError : naming the first malformed line; `name` says what kind of line was expected.
-
-    """
-    dtype = np.dtype([('ids', np.int64, (ids,)), ('values', np.float64, (values,))])
-    rows = _convert(lines.texts, dtype)
-    if rows is None:
-        k = first_failure(len(lines.texts),
-                          lambda part: _convert(lines.texts[part], dtype) is not None)
-        found = _complaint(lines.texts[k], ids, values)
-        finite = f' and {values} finite' if values else ''
-        raise FileError(path, f'{name}: {found}; expected {ids} whole{finite} numbers',
-                        lines.numbers[k])
-    return rows['ids'], rows['values']
-
-
-def refuse_quaternions(path: object, quaternions: Array, numbers: list[int]) -> None:
-    """Raise for the first of the quaternions (m, 4) whose norm is not 1; numbers : their lines."""
-    far = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > QUATERNION_NORM_ERROR
-    if far.any():
-        k = int(np.argmax(far))
-        raise FileError(path, f'quaternion {quaternions[k].tolist()}; expected one of norm 1',
-                        numbers[k])
 
 
 def first_failure(count: int, works: Callable[[slice], bool]) -> int:
@@ -297,44 +262,3 @@ def rounded(values: Array) -> Array:
     scale = np.array([float(f'1e{k}') for k in range(23)])[places]
     decimal = np.rint(values * scale) / scale
     return np.where(np.abs(decimal - values) <= 4 * np.spacing(magnitude), decimal, values)
-
-
-def _convert(texts: list[str], dtype: np.dtype) -> np.ndarray | None:
-    """Return the rows as a structured array, or None if any of them is malformed."""
-    rows = _numbers(texts, dtype)
-    # Written so that NaN fails, too.
-    if rows is None or not (np.abs(rows['values']) <= LARGEST).all():
-        return None
-    return rows
-
-
-def _numbers(texts: list[str], dtype: np.dtype) -> np.ndarray | None:
-    """Return the rows as a structured array, or None if any of them has other fields."""
-    if not texts:
-        return np.empty(0, dtype)
-    with warnings.catch_warnings():
-        # NumPy only warns about missing data and, before 2.0, about an id such as 1.5.
-        warnings.simplefilter('error')
-        try:
-            rows: np.ndarray = np.loadtxt(texts, dtype, ndmin=1, encoding=None)
-        except (ValueError, Warning):
-            return None
-    # `loadtxt` skips rows without any field.
-    return rows if len(rows) == len(texts) else None
-
-
-def _complaint(text: str, ids: int, values: int) -> str:
-    """Say what is wrong with one line."""
-    fields = text.split('#', 1)[0].split()
-    if len(fields) != ids + values:
-        return counted(len(fields), 'field')
-    for field in fields[:ids]:
-        if _numbers([field], np.dtype([('values', np.int64, (1,))])) is None:
-            return f'{quoted(field)} is not a whole number of 64 bits'
-    for field in fields[ids:]:
-        number = _numbers([field], np.dtype([('values', np.float64, (1,))]))
-        if number is None or not np.isfinite(number['values']).all():
-            return f'{quoted(field)} is not a finite number'
-        if np.abs(number['values']) > LARGEST:
-            return f'{quoted(field)} is beyond {LARGEST:g}'
-    return f'{quoted(text)} is not understood'

@@ -24,10 +24,13 @@ _ROOT = Path('/')
 # of that is kept for files and given back when it is needed.
 _LIMITS = (('memory.max', 'memory.current', 'inactive_file'),
            ('memory.limit_in_bytes', 'memory.usage_in_bytes', 'total_inactive_file'))
-# Settings of glibc's mallopt: how many arrays may be memory of their own; and from how many bytes
-# on what is free at the end is given back.
-_MMAP_MAX, _TRIM_THRESHOLD = -4, -1
+# Settings of glibc's mallopt: how many arrays may be memory of their own; the size from which one
+# is; and from how many bytes on what is free at the end is given back. By default glibc raises the
+# last two, to tens of megabytes a thread.
+_MMAP_MAX, _MMAP_THRESHOLD, _TRIM_THRESHOLD = -4, -3, -1
 _KEPT = 2**30
+# [bytes] From this size on NumPy asks for huge pages: fresh ones cost as little as reused ones.
+_HUGE = 2**22
 
 
 def free_memory(root: Path = _ROOT) -> float:
@@ -40,15 +43,26 @@ def free_memory(root: Path = _ROOT) -> float:
 
 def keep_freed_memory() -> None:
     """
-    Let the process keep what is freed for its next arrays, as far as the C library is glibc.
+    Let the process keep what is freed for its next arrays.
 
     An array of some megabytes is else new memory of the system each time: to be given its pages
     takes longer than the sums that it is for.
     """
+    _set({_MMAP_MAX: 0, _TRIM_THRESHOLD: _KEPT})
+
+
+def give_back_freed_memory() -> None:
+    """Let a process that runs for long, with a map, give back what is freed of large arrays."""
+    # The ratio that glibc itself keeps between the two.
+    _set({_MMAP_THRESHOLD: _HUGE, _TRIM_THRESHOLD: 2 * _HUGE})
+
+
+def _set(options: dict[int, int]) -> None:
+    """Set options of `mallopt`, as far as the C library is glibc."""
     with suppress(AttributeError, OSError):
         mallopt = ctypes.CDLL(None).mallopt
-        mallopt(_MMAP_MAX, 0)
-        mallopt(_TRIM_THRESHOLD, _KEPT)
+        for option, value in options.items():
+            mallopt(option, value)
 
 
 def _left_of_address_space(root: Path) -> float:

@@ -25,15 +25,14 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.io.files import (
     TextLines,
     counted,
-    parse_rows,
     quoted,
     read_lines,
-    refuse_quaternions,
     stamp_from_text,
     stamp_text,
     write_lines,
 )
 from l1slam_ros.io.graphs.graph_file import read_vertices
+from l1slam_ros.io.graphs.parsing import parse_rows, refuse_quaternions
 from l1slam_ros.io.jrl.layout import JRL_SUFFIXES
 from l1slam_ros.io.ours import marked
 

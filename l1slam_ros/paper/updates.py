@@ -38,6 +38,7 @@ from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.compilation import load
 from l1slam_ros.io.files import invented_stamps
+from l1slam_ros.io.free_memory import give_back_freed_memory
 
 # [m or rad] ISAM2 linearises again what has moved by more, after each pose.
 _RELINEARISE = 0.1
@@ -280,6 +281,7 @@ def measure_growth(keyframes: int, rate: float, rng: np.random.Generator,
     the map as it is, ordered anew.
     """
     load()
+    give_back_freed_memory()
     run_updates(Drive.of(_world(_WARM_UP, rng)), None, np.inf, 1)
     graph = _world(keyframes, rng)
     with isam2(lambda: graph) if importlib.util.find_spec('gtsam') else nullcontext() as peer:

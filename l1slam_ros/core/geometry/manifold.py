@@ -78,7 +78,12 @@ class Manifold(Protocol):
     def residual_curvature(
         self, measurement: Array, pose_i: Array, pose_j: Array, dual: Array
     ) -> Array:
-        """Return the Hessian of dual'e over (step of i, step of j), (n, 2 d, 2 d); dual (n, d)."""
+        """
+        Return the Hessian of dual'e over (step of i, step of j), where it is not zero.
+
+        Its rows of the r turns of i, then of j, (n, 2, r, 2 d), which are its columns, too: apart
+        from turns, a residual is linear in steps. dual (n, d)
+        """
 
     def local_jacobian(self, a: Array, b: Array) -> Array:
         """Return J_l_b of `local`, (n, d, d)."""

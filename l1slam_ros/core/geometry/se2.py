@@ -111,10 +111,10 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> Arra
 
 def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: Array) -> Array:
     """
-    Return the Hessian of dual'e over (step of i, step of j), (n, 6, 6); dual (n, 3).
+    Return the rows of turns of the Hessian of dual'e, (n, 2, 1, 6); dual (n, 3); see `manifold`.
 
     With m = Rz y_t, h = Rij' m (minus and plus the gradients of the positions) and
-    t = Ri'(tj - ti), the entries (and their mirrors) are (theta_i, x_i) = m_y,
+    t = Ri'(tj - ti), the entries are (theta_i, x_i) = m_y,
     (theta_i, y_i) = -m_x, (theta_i, theta_i) = -m.t, (theta_i, x_j) = -h_y,
     (theta_i, y_j) = h_x. The residual is linear in all else.
     """

@@ -160,9 +160,9 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> Arra
 
 def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: Array) -> Array:
     """
-    Return the Hessian of dual'e over (step of i, step of j), (n, 12, 12); dual (n, 6).
+    Return the rows of turns of the Hessian of dual'e, (n, 2, 3, 12); dual (n, 6); see `manifold`.
 
-    With m = Rz y_t and y the dual's rotation part, the blocks (and their mirrors) are
+    With m = Rz y_t and y the dual's rotation part, the blocks (and that of om_j by om_i) are
     `(om_i, rho_i) = -[m]x`, `(om_i, rho_j) = [m]x Rij`,
     `(om_i, om_i) = (m p' + p m')/2 - (m.p + q_v.y/2) I`, `(om_j, om_j) = -(q_v.y)/2 I`,
     `(om_i, om_j) = Rij ((q_v.y) I + [q_w y - q_v x y]x)/2`. The residual is linear in all else.

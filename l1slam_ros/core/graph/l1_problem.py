@@ -68,7 +68,7 @@ class GraphProblem:
         return compose_tree(manifold, parent, chain)
 
     def curvature(self, poses: Array, dual: Array) -> Array:
-        """Return the Hessian of dual'e for each factor, (m, 2 k, 2 k)."""
+        """Return the Hessian of dual'e for each factor, (m, 2, r, 2 k), see `Manifold`."""
         manifold, factors = self.graph.manifold, self.graph.between
         k = manifold.TANGENT_SIZE
         # That of the residual before it is whitened: L y.

@@ -23,6 +23,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
@@ -177,6 +178,20 @@ def keyframes_of(graph: FactorGraph, fixed: int) -> Indices:
     """Return the free keyframes that each factor moves, (m, 2); see `LinearSystem`."""
     keyframe = np.stack((graph.between.i, graph.between.j), axis=1) - fixed
     return np.where(keyframe < 0, graph.n_poses - fixed, keyframe)
+
+
+def neighbours(keyframe: Indices, size: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """
+    Return the neighbours of each free keyframe k, adjacent[start[k]:start[k + 1]], int32.
+
+    Each once, ascending, both ways round; keyframe, size : see `LinearSystem`
+    """
+    i, j = keyframe[(keyframe < size).all(axis=1)].T
+    # Not by `np.unique`, whose table of hashes takes longer than to sort.
+    joined = np.sort(np.concatenate((i * size + j, j * size + i)))
+    row, adjacent = np.divmod(joined[np.diff(joined, prepend=-1) > 0], max(size, 1))
+    start = np.searchsorted(row, np.arange(size + 1)).astype(np.int32)
+    return start, adjacent.astype(np.int32)
 
 
 def step_poses(graph: FactorGraph, poses: Array, x: Array) -> Array:

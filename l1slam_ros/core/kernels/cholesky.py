@@ -34,7 +34,7 @@ _AHEAD = 16
 
 _PANELS = 'f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1]'
 _FACTORS = ('f8[::1], i8[:, ::1], i8[::1], i8[::1], b1[::1], i8[::1], i8[::1], f8[:, :, :, ::1], '
-            'f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8')
+            'f8[:, ::1], f8[:, ::1], f8[:, :, :, ::1], f8')
 
 
 @for_sizes(_FACTORS, ANY_SIZE)
@@ -45,7 +45,9 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
 
     keyframe : (m, 2), blocks : (m, 2, k, k), see `LinearSystem`; weights : (m, k); diagonal :
     (n, k)
-    curvature : (m', 2 k, 2 k) of the first m' factors, C is their sum
+    curvature : (m', 2, k // 2, 2 k) of the first m' factors, of each the rows of the turns, the
+        last entries, of keyframe i, and of j, which are its columns, too; all else is zero. C is
+        their sum
     address, width : (m,) where the block between the keyframes i and j of each factor lies, and
     the stride of its panel; address -1: there is none
     turned : (m,) bool, that block is the one of row i and column j
@@ -53,7 +55,9 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
 
     Returns the sum of what it read ahead, which is of no use.
     """
-    k = len(size)
+    # Of three and of six numbers a step turns by one and by three. A number that is known when the
+    # loop is compiled; it is not asked of `curvature`, for that takes longer.
+    k, still = len(size), len(size) - len(size) // 2
     for at in range(len(panels)):
         panels[at] = 0.0
     # Keyframes' own blocks are summed up side by side: in the panels they lie far apart, and each
@@ -73,9 +77,12 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
                     total = 0.0
                     for a in range(k):
                         total += blocks[f, side, a, r] * scaled[side, a, c]
-                    if bent:
-                        total += share * curvature[f, side * k + r, side * k + c]
                     own[keyframe[f, side], r, c] += total
+            if bent:
+                for r in range(still, k):
+                    for c in range(r + 1):
+                        own[keyframe[f, side], r, c] += (
+                            share * curvature[f, side, r - still, side * k + c])
         if address[f] < 0:
             continue
         left = 0 if turned[f] else 1
@@ -85,9 +92,17 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
                 total = 0.0
                 for a in range(k):
                     total += blocks[f, left, a, r] * scaled[right, a, c]
-                if bent:
-                    total += share * curvature[f, left * k + r, right * k + c]
                 panels[address[f] + r * width[f] + c] += total
+        if bent:
+            at = address[f]
+            for r in range(still):
+                for c in range(still, k):
+                    panels[at + r * width[f] + c] += (
+                        share * curvature[f, right, c - still, left * k + r])
+            for r in range(still, k):
+                for c in range(k):
+                    panels[at + r * width[f] + c] += (
+                        share * curvature[f, left, r - still, right * k + c])
     for v in range(len(corner)):
         for r in range(k):
             for c in range(r + 1):

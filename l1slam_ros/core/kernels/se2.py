@@ -59,8 +59,8 @@ def jacobians(z, x_i, x_j):
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])')
 def curvature(z, x_i, x_j, dual):
-    """Return the Hessian of dual'e over (step of i, step of j), (m, 6, 6); dual (m, 3)."""
-    H = np.empty((len(x_i), 6, 6))
+    """Return the rows of turns of the Hessian of dual'e, (m, 2, 1, 6); see `manifold`."""
+    H = np.empty((len(x_i), 2, 1, 6))
     for f in range(len(x_i)):
         H[f] = 0.0
         t = _seen(x_i[f], x_j[f])
@@ -68,9 +68,8 @@ def curvature(z, x_i, x_j, dual):
         mx, my = c * dual[f, 0] - s * dual[f, 1], s * dual[f, 0] + c * dual[f, 1]
         theta = x_j[f, 2] - x_i[f, 2]
         c, s = np.cos(theta), np.sin(theta)
-        H[f, 2, 0], H[f, 2, 1] = my, -mx
-        H[f, 2, 2] = -(mx * t[0] + my * t[1])
-        H[f, 2, 3], H[f, 2, 4] = s * mx - c * my, c * mx + s * my
-        for column in (0, 1, 3, 4):
-            H[f, column, 2] = H[f, 2, column]
+        of_i = H[f, 0, 0]
+        of_i[0], of_i[1] = my, -mx
+        of_i[2] = -(mx * t[0] + my * t[1])
+        of_i[3], of_i[4] = s * mx - c * my, c * mx + s * my
     return H

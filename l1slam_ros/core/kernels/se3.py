@@ -108,8 +108,8 @@ def _write_skew(v, matrix):
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])')
 def curvature(z, x_i, x_j, dual):
-    """Return the Hessian of dual'e over (step of i, step of j), (m, 12, 12); dual (m, 6)."""
-    H = np.zeros((len(z), 12, 12))
+    """Return the rows of turns of the Hessian of dual'e, (m, 2, 3, 12); see `manifold`."""
+    H = np.zeros((len(z), 2, 3, 12))
     R, S, K = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for f in range(len(z)):
         p, q_ij, q = _seen(z[f], x_i[f], x_j[f])
@@ -126,17 +126,15 @@ def curvature(z, x_i, x_j, dual):
                      q[3] * y[2] - q[0] * y[1] + q[1] * y[0]), K)
         for k in range(3):
             K[k, k] = along
-            H[f, 3 + k, 3 + k] = m[k] * p[k] - pull - along / 2
-            H[f, 9 + k, 9 + k] = -along / 2
+            H[f, 0, k, 3 + k] = m[k] * p[k] - pull - along / 2
+            H[f, 1, k, 9 + k] = -along / 2
         for r in range(3):
             for c in range(3):
-                H[f, 3 + r, c] = -S[r, c]
+                H[f, 0, r, c] = -S[r, c]
                 if c < r:
-                    H[f, 3 + r, 3 + c] = H[f, 3 + c, 3 + r] = (m[r] * p[c] + p[r] * m[c]) / 2
+                    H[f, 0, r, 3 + c] = H[f, 0, c, 3 + r] = (m[r] * p[c] + p[r] * m[c]) / 2
                 for k in range(3):
-                    H[f, 3 + r, 6 + c] += S[r, k] * R[k, c]
-                    H[f, 3 + r, 9 + c] += R[r, k] * K[k, c] / 2
-        for r in range(3, 6):
-            for c in (0, 1, 2, 6, 7, 8, 9, 10, 11):
-                H[f, c, r] = H[f, r, c]
+                    H[f, 0, r, 6 + c] += S[r, k] * R[k, c]
+                    H[f, 0, r, 9 + c] += R[r, k] * K[k, c] / 2
+                H[f, 1, c, 3 + r] = H[f, 0, r, 9 + c]
     return H

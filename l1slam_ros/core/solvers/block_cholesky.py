@@ -32,6 +32,7 @@ from l1slam_ros.core.graph.linear_system import (
     anchor,
     keyframes_of,
     loose_keyframes,
+    neighbours,
     size_of_blocks,
 )
 
@@ -63,13 +64,15 @@ _LINE, _WIDE = 8, 64
 # Bytes of a number, and of all that a solve keeps of a factor for each entry of one of its
 # Jacobians: measured, 1.7 kB of a factor in the plane, most of it rows of the interior point.
 _NUMBER, _BYTES_PER_ENTRY = 8, 190
-# Seconds that the steps of an exact L1 map, its seed included, take of a factor for each such
-# entry; how many factorisations it needs, and how many multiplications a second has: measured from
-# 25,000 to 200,000 keyframes on a core of the machine of doc/performance.md; at 1,000,000 it takes
-# 1.4 times as long, and 1.1 times the memory.
-_SECONDS_PER_ENTRY = 6e-6
-_FACTORISATIONS = 45
+# Seconds that the steps of an exact L1 map, its start included, take of a factor for each such
+# entry, and for each of a block of the Cholesky factor; how many factorisations they need, and how
+# many multiplications a second has: measured on a core of the machine of doc/performance.md.
+_SECONDS_PER_ENTRY, _SECONDS_PER_FILL = 4.3e-7, 1.05e-7
+_FACTORISATIONS = 20
 _RATE = 1e10
+# From so many keyframes on steps become more, as their fourth root: 14 of 10,000 keyframes, 19,
+# 25, 31 and 45 of 25,000, 100,000, 200,000 and 1,000,000.
+_WIDE_GRAPH = 10_000
 # Seconds a keyframe to find separators over the part of all multiplications that they spare.
 _SEARCH = 1.4e-5 / 0.5
 
@@ -108,7 +111,7 @@ class Pattern:
 
 
 def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
-                 before: Pattern | None = None, uses: int = _FACTORISATIONS) -> Pattern:
+                 before: Pattern | None = None, uses: float | None = None) -> Pattern:
     """
     Return the best elimination order that is found, and the pattern of its factor.
 
@@ -120,7 +123,8 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
     before : of fewer keyframes and factors. Up to `GROWN` times as many, only keyframes that new
         factors join and those above them in the elimination tree are ordered anew: that takes a
         fifth of the time, and fills in little more
-    uses : factorisations to come; for few, separators are not worth the time
+    uses : factorisations to come, None: those of an exact L1 map; for few, separators are not
+        worth the time
 
     Raises
     ------
@@ -134,6 +138,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
         if pattern is not None and pattern.blocks <= most_blocks:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
+    uses = uses or _factorisations(size)
     vast = max(VAST, _SEARCH * size * _RATE / uses) if len(graph[1]) < _CROWDED * size else np.inf
     for dissect, least in (kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, vast):
         if pattern is None or pattern.work * k**3 > max(_LONG * size, least):
@@ -151,8 +156,15 @@ def needs(graph: FactorGraph, blocks: float, work: float) -> memory.Needs:
     """Predict the time and memory of solving a graph from the blocks and work of its factor."""
     k = graph.manifold.TANGENT_SIZE
     m = len(graph.between)
+    repeated = _factorisations(graph.n_poses)
+    entries = _SECONDS_PER_ENTRY * k**2 * m + _SECONDS_PER_FILL * k**2 * blocks
     return memory.Needs(blocks * _bytes_of_block(graph) + _BYTES_PER_ENTRY * k**2 * m,
-                        _SECONDS_PER_ENTRY * k**2 * m + _FACTORISATIONS * work * k**3 / _RATE)
+                        repeated * (entries / _FACTORISATIONS + work * k**3 / _RATE))
+
+
+def _factorisations(size: int) -> float:
+    """Return how many factorisations an exact L1 map of so many keyframes needs."""
+    return _FACTORISATIONS * max(1.0, size / _WIDE_GRAPH) ** 0.25
 
 
 def most_blocks(graph: FactorGraph) -> int:
@@ -182,20 +194,6 @@ def _laid_out(graph: tuple[Places, Places], most_blocks: int, stage: Places, beg
     return Pattern(*(*kernels.symbolic.lay_out(*columns), columns, found))
 
 
-def neighbours(keyframe: Indices, size: int) -> tuple[Places, Places]:
-    """
-    Return the neighbours of each free keyframe k, adjacent[start[k]:start[k + 1]], int32.
-
-    Each once, ascending, both ways round; keyframe, size : as in `LinearSystem`
-    """
-    i, j = keyframe[(keyframe < size).all(axis=1)].T
-    # Not by `np.unique`, whose table of hashes takes longer than to sort.
-    joined = np.sort(np.concatenate((i * size + j, j * size + i)))
-    row, adjacent = np.divmod(joined[np.diff(joined, prepend=-1) > 0], max(size, 1))
-    start = np.searchsorted(row, np.arange(size + 1)).astype(np.int32)
-    return start, adjacent.astype(np.int32)
-
-
 class BlockCholesky:
     """
     Factors the normal matrices of all systems whose factors join the same keyframes.
@@ -222,15 +220,15 @@ class BlockCholesky:
         """
         Factor J'WJ + diag(diagonal) + share C; False: it is not positive definite.
 
-        weights : (rows,); diagonal : (columns,) or one number; curvature : (m, 2 k, 2 k) of each
-        factor, C their sum
+        weights : (rows,); diagonal : (columns,) or one number; curvature : (m, 2, r, 2 k) of
+        each factor, as `Manifold.residual_curvature` has it, C their sum
         """
         k = system.block_size
         layout = self._layouts.get(k)
         if layout is None:
             layout = self._layouts[k] = _Layout(self.pattern, self._keyframe, k)
         if curvature is None or not share:
-            curvature = np.empty((0, 2 * k, 2 * k))
+            curvature = np.empty((0, 2, k // 2, 2 * k))
         added = np.full(system.size * k, diagonal, float).reshape(-1, k)
         if len(self._loose):
             own = system.diagonal(weights).reshape(-1, k)[self._loose]
@@ -330,7 +328,7 @@ def _whole_lines(numbers: Indices) -> Indices:
 
 
 def cholesky_of(graph: FactorGraph, before: Pattern | None = None,
-                uses: int = _FACTORISATIONS) -> BlockCholesky:
+                uses: float | None = None) -> BlockCholesky:
     """
     Return what factors the systems of a graph; before, uses : see `find_pattern`.
 

@@ -21,12 +21,11 @@ from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.io.files import (
     TextLines,
     counted,
-    parse_rows,
     quoted,
     read_lines,
-    refuse_quaternions,
 )
 from l1slam_ros.io.graphs.left_out import restored
+from l1slam_ros.io.graphs.parsing import parse_rows, refuse_quaternions
 from l1slam_ros.io.graphs.tags import OFFSET, TAGS, TAGS_LEFT_OUT
 from l1slam_ros.io.remarks import Remarks
 
@@ -88,15 +87,18 @@ def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
     """Read a graph file; return its lines by their tags."""
     lines, left_out = restored(read_lines(path))
     groups: dict[str, TextLines] = {}
-    for number, text in zip(lines.numbers, lines.texts, strict=True):
-        tag, _, rest = text.partition(' ')
-        if (group := groups.get(tag)) is None:
-            # A new tag, or other whitespace beside it.
-            tag, *behind = text.split(None, 1)
-            rest = ''.join(behind)
-            group = groups.setdefault(tag, TextLines([], []))
-        group.numbers.append(number)
-        group.texts.append(rest.lstrip())
+    texts, begin = lines.texts, 0
+    while begin < len(texts):
+        tag, *behind = texts[begin].split(None, 1)
+        group = groups.setdefault(tag, TextLines([], []))
+        end = begin + _alike(texts, begin, f'{tag} ')
+        if end > begin:
+            group.texts.extend(text[len(tag) + 1:].lstrip() for text in texts[begin:end])
+        else:  # other whitespace beside the tag
+            end = begin + 1
+            group.texts.append(''.join(behind))
+        group.numbers.extend(lines.numbers[begin:end])
+        begin = end
     if not groups:
         raise FileError(path, f'the file is empty; expected {expected_tags("between")} lines')
     known = TAGS.keys() | TAGS_LEFT_OUT.keys() | {'FIX'}
@@ -106,6 +108,12 @@ def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
             raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(usual)}',
                             group.numbers[0])
     return GraphLines(groups, left_out, lines.remarks, lines.comments)
+
+
+def _alike(texts: list[str], begin: int, head: str) -> int:
+    """Return how many lines from `begin` on start with a head, one after the other."""
+    return next((k for k in range(len(texts) - begin) if not texts[begin + k].startswith(head)),
+                len(texts) - begin)
 
 
 def expected_tags(kind: str) -> str:

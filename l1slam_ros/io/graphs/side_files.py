@@ -31,7 +31,6 @@ from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.io.files import (
     NANOSECONDS,
     formatted,
-    parse_rows,
     put_lines,
     quoted,
     read_lines,
@@ -39,6 +38,7 @@ from l1slam_ros.io.files import (
     reported,
     stamp_from_text,
 )
+from l1slam_ros.io.graphs.parsing import parse_rows
 from l1slam_ros.io.ours import marked
 
 # What may be beside an input; and of that, what is written, or else removed, beside a graph.

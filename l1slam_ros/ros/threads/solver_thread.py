@@ -17,6 +17,7 @@ from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.io.compilation import STEPS, fill_cache, load, with_space
+from l1slam_ros.io.free_memory import give_back_freed_memory
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.parameters import NodeParameters
 from l1slam_ros.ros.threads.background import background
@@ -142,6 +143,7 @@ class SolverThread:
                 whole = fill_cache(report, self.is_closing, steps)
             if whole:
                 load(steps)
+                give_back_freed_memory()
             else:
                 self._logger.debug('not all is compiled yet: the rest is when it is first called')
         except Exception as error:

@@ -197,14 +197,18 @@ def test_a_pattern_of_more_factors_serves_fewer(rng):
 # What may be added to the matrix
 
 
+@pytest.mark.parametrize('k', [3, 6])
 @pytest.mark.parametrize('share', [0.0, 0.3, 1.0])
 @pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)
-def test_a_share_of_the_curvature_is_added(shape, share, rng):
-    """Of the first factors alone; the last ones are priors, which have none."""
-    k, system = 3, random_system(3 * shape(N), N, 3, rng)
+def test_a_share_of_the_curvature_is_added(shape, share, k, rng):
+    """Of the first factors alone, by turns; the last ones are priors, which have none."""
+    system = random_system(3 * shape(N), N, k, rng)
     m = len(system.keyframe) - 3
+    turns = np.arange(2 * k).reshape(2, k)[:, k - k // 2:]
     curvature = 0.1 * rng.standard_normal((m, 2 * k, 2 * k))
     curvature += curvature.transpose(0, 2, 1)
+    straight = np.delete(np.arange(2 * k), turns.ravel())
+    curvature[:, straight[:, None], straight] = 0
     C = np.zeros(((N + 1) * k,) * 2)
     for f, pair in enumerate(system.keyframe[:m]):
         rows = (pair[:, None] * k + np.arange(k)).ravel()
@@ -212,7 +216,8 @@ def test_a_share_of_the_curvature_is_added(shape, share, rng):
     matrix = normal(system, np.ones(len(system.b)), 3.0) + share * C[:-k, :-k]
     cholesky = cholesky_of_system(system)
     assert np.linalg.eigvalsh(matrix)[0] > 0
-    assert cholesky.factorise(system, np.ones(len(system.b)), 3.0, curvature, share)
+    assert cholesky.factorise(system, np.ones(len(system.b)), 3.0,
+                              np.ascontiguousarray(curvature[:, turns]), share)
     check_solution(cholesky, matrix, rng)
 
 

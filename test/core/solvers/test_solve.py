@@ -36,19 +36,21 @@ def world(rng):
 @pytest.fixture
 def dense(rng):
     """A graph whose far places are joined at random: half of it ends in one dense block."""
-    truth = drive(600, rng)
-    pairs = chain_and_loops(600, 4000, rng)
+    truth = drive(1000, rng)
+    pairs = chain_and_loops(1000, 3000, rng)
     return graph_of(truth, pairs, 0.01 * rng.standard_normal((len(pairs), 3)))
 
 
 def test_sparse_graphs_get_the_interior_point_and_dense_ones_algorithm_4(world, dense):
-    for graph, expected, expected_reason in ((world.graph, INTERIOR_POINT, 'sparse'),
-                                             (dense, PRIMAL_DUAL, 'dense')):
+    short = OptimiserOptions(outer_iterations=1)
+    for graph, expected, expected_reason, options in (
+            (world.graph, INTERIOR_POINT, 'sparse', DEFAULTS),
+            (dense, PRIMAL_DUAL, 'dense', short)):
         method = choose(AUTO, graph)
         assert (method.solver, method.falls_back) == (expected, True)
         assert method.cholesky is not None
         assert method.reason == f'the graph is {expected_reason}'
-        _, solver = minimise_by(method, graph, seed_poses(graph, method.cholesky), DEFAULTS)
+        _, solver = minimise_by(method, graph, seed_poses(graph, method.cholesky), options)
         assert solver == expected
 
 
@@ -110,6 +112,17 @@ def test_the_memory_of_the_factor_is_predicted_to_a_third(rng):
     taken = sum(layout.panels.nbytes for layout in method.cholesky._layouts.values())
     blocks = method.needs.memory - block_cholesky.needs(graph, 0.0, 0.0).memory
     assert 0.75 * taken < blocks < 1.33 * taken
+
+
+def test_the_time_is_predicted_by_factors_by_fill_and_by_work(rng):
+    """More of each takes longer; ten times the factors, less than thrice as long."""
+    sparse, crowded = (simulate_world(600, edges, WorldOptions(), rng).graph
+                       for edges in (1200, 12000))
+    blocks, work = 10_000, 300_000.0
+    first = block_cholesky.needs(sparse, blocks, work).seconds
+    assert first < block_cholesky.needs(crowded, blocks, work).seconds < 3 * first
+    assert first < block_cholesky.needs(sparse, 2 * blocks, work).seconds < 2 * first
+    assert first < block_cholesky.needs(sparse, blocks, 2 * work).seconds < 2 * first
 
 
 def test_what_does_not_fit_grows_with_the_graph_and_what_fits_is_never_refused(monkeypatch, rng):
