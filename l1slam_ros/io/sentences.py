@@ -67,8 +67,8 @@ _REASONS = {
     OTHER_MAP: '{loops} refused loops agree with each other on another map, {where}',
     SLIP: 'the odometry may have slipped {where}: the {loops} loops across it that are used do '
           'not decide that',
-    DRIFTS: 'the odometry turns by about {detail} rad per metre too much, {where}: the {loops} '
-            'loops that are used were too few to correct that, and it was taken for noise',
+    DRIFTS: 'the odometry may turn by about {detail} rad per metre too much, {where}: the {loops} '
+            'loops that are used do not decide that',
     UNFINISHED: 'the judgement of the loops did not come to an end: the {loops} loops that are '
                 'left out, {where}, were still being accepted, a few at a time',
     NORM: 'the map differs by more than noise explains from the least squares map of the same '

@@ -40,9 +40,10 @@ A slip
     fit, lies are the other: `slips` compares their odds, with half a gate for each place that one
     of them calls a lie.
 A drift
-    is an error of all steps, the same on each metre. Where loops are left out it is a third
-    explanation, asked before slips: odometry rid of it has to win a place (`drift`). Where all
-    came in because the drift was learnt as noise, it is seen in what they leave of the odometry.
+    is an error of all steps, the same on each metre. Where loops are left out, or the odometry is
+    far noisier than it says, it is a third explanation, asked before slips: odometry rid of it has
+    to win places, or be far less noisy (`drift`). Where all came in because the drift was learnt
+    as noise, it is seen in what they leave of the odometry.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
@@ -76,7 +77,7 @@ from l1slam_ros.core.robust.judgement import (
     judgement_of,
     listed,
 )
-from l1slam_ros.core.robust.odometry.drift import straightened, vote
+from l1slam_ros.core.robust.odometry.drift import CALMER, explains, straightened, vote, won
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.evidence import REFUSED
@@ -124,7 +125,7 @@ def robust_solve(
         for number, growth in enumerate(rounds(first, repair), 1):
             so_far = _so_far(growth, repair.drift)
             report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
-        judgement = judgement_of(growth, doubts(growth, number < _MOST_ROUNDS))
+        judgement = judgement_of(growth, doubts(growth, number < _MOST_ROUNDS, repair.rival))
         return replace(judgement, drift=repair.drift), growth.poses
     except _FAILURES as error:
         judgement, poses = known or so_far
@@ -132,13 +133,17 @@ def robust_solve(
 
 
 class _Repair:
-    """What loops that are left out may be right by; drift : that of the odometry [rad/m]."""
+    """
+    What loops that are left out may be right by.
+
+    drift : that of the odometry [rad/m]; rival : by how much more it may be.
+    """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None]):
         self._graph = graph
         self._check = check
         self._asked = False
-        self.drift = 0.0
+        self.drift = self.rival = 0.0
 
     def __call__(self, found: Growth, as_stated: Growth) -> Growth | None:
         """Return a state without a drift, asked once, or without a slip; None: there is none."""
@@ -147,29 +152,32 @@ class _Repair:
         return straight or without_slip(found, as_stated)
 
     def _straightened(self, as_stated: Growth) -> Growth | None:
-        """Return the state without a drift that wins a place, or was taken for noise."""
-        voted, odds = vote(self._graph) if len(as_stated.undecided()) else (0.0, 0.0)
-        for drift, more in ((voted * (odds > 0), 1), (drift_taken_for_noise(as_stated), 0)):
-            if drift:
-                straight, told = self._without(drift)
-                if _won(as_stated, told) >= _won(as_stated, as_stated) + more:
-                    self.drift = drift
+        """Return the state without a drift that explains the loops, or was taken for noise."""
+        if len(as_stated.undecided()) or as_stated.noise.variance[0] > CALMER:
+            voted, odds, rival = vote(self._graph)
+            for straight, told in self._without(voted) if odds > 0 else ():
+                if explains(told, as_stated):
+                    self.drift, self.rival = voted, rival
                     return straight
+        taken = drift_taken_for_noise(as_stated)
+        for straight, told in self._without(taken) if taken else ():
+            if won(as_stated, told) >= won(as_stated, as_stated):
+                self.drift = taken
+                return straight
         return None
 
-    def _without(self, drift: float) -> list[Growth]:
-        """Return the states, as found and as stated, that odometry without its drift leads to."""
+    def _without(self, drift: float) -> list[tuple[Growth, Growth]]:
+        """
+        Return the states, as found and as stated, that odometry without its drift leads to.
+
+        None, (), where that comes to no end.
+        """
         growth = Growth(straightened(self._graph, drift), self._check)
-        ends: list[Growth] = []
+        ends: list[tuple[Growth, Growth]] = []
         growth.begin()
-        for _ in rounds(growth, lambda *states: ends.extend(states)):
+        for _ in rounds(growth, lambda *states: ends.append(states)):
             self._check()
         return ends
-
-
-def _won(places_of: Growth, growth: Growth) -> int:
-    """Return of how many places the loops are that a state accepts."""
-    return len(np.unique(places_of.given.place[growth.accepted & growth.given.is_loop]))
 
 
 def _so_far(growth: Growth, drift: float = 0.0) -> Believed:

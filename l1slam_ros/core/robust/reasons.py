@@ -46,8 +46,12 @@ from l1slam_ros.core.robust.places import join_what_no_other
 from l1slam_ros.core.robust.rounds.growth import Growth
 
 
-def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
-    """Return the reasons to doubt a map; none: (); ended : nothing more can be accepted."""
+def doubts(growth: Growth, ended: bool = True, rival: float = 0.0) -> tuple[Doubt, ...]:
+    """
+    Return the reasons to doubt a map; none: ().
+
+    ended : nothing more can be accepted; rival : by how much more the odometry may drift [rad/m]
+    """
     size = growth.given.size
     loops = growth.given.is_loop[:size]
     left_out = np.flatnonzero(loops & ~growth.accepted[:size])
@@ -65,7 +69,9 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
         _slip_doubt(growth, step)
         for step, odds in growth.slip_odds.items()
         if (odds < SURE if growth.cut[step] else odds > -SURE)]
-    reasons += _drift_doubt(growth, accepted)
+    drift = rival or drift_taken_for_noise(growth)
+    if drift:
+        reasons.append(replace(_doubt(growth, DRIFTS, accepted), detail=f'{-drift:+.2g}'))
     return tuple(dict.fromkeys(reasons))
 
 
@@ -182,13 +188,6 @@ def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
     given = growth.given
     return doubt_of(given.factors.pairs[rows], given.graph.n_poses, kind)
-
-
-def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:
-    drift = drift_taken_for_noise(growth)
-    if not drift:
-        return []
-    return [replace(_doubt(growth, DRIFTS, accepted), detail=f'{-drift:+.2g}')]
 
 
 def _slip_doubt(growth: Growth, step: int) -> Doubt:

@@ -17,32 +17,49 @@ between them, says by how much the odometry has turned too little:
 
 the noise normal, of the loop and of q times what the odometry states of its turns; a lie says any
 angle. The share of true loops is found with it (expectation and maximisation). Loops of one place
-have one vote. Wheels of unequal size, or a gyroscope with an offset, do that.
+have a vote for each stretch of it. Wheels of unequal size, or a gyroscope with an offset, do that.
+
+Angles are the same after a full turn, and a robot that goes round in laps turns as much all the
+time: lies that say two poses look the same way agree on a drift by which it never turned. So
+angles only propose drifts. Which one it is, positions decide, with the covariance that the noise
+of all steps between makes of angle and position. Laps may close with a turn more on each even so:
+of drifts that are nearly as likely the least one is taken, and the map is doubtful.
 
 Source: ours, by the recorded logs that `test_drift.py` names where they are.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import covariance_of
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph, ends_in_time
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.places import places
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 # [rad/m] What wheels and gyros drift by: its standard deviation, and the most that is looked for.
 _USUAL, _MOST = 0.03, 0.18
-# From coarse to fine: steps of the drift, each a part of the one before.
-_STEP = 0.004
-_FINER = 5.0
-_LEVELS = 3
+# [rad/m] Drifts are looked for so far apart; near so many of the likeliest, so many times as near,
+# until the longest loop tells them apart by no more than so much [rad].
+_STEP, _PEAKS, _FINER, _FINE = 0.0008, 40, 5, 0.02
+# Nearly as likely as the likeliest is a drift, or none, with this part of its odds to all loops
+# being lies: those of a lap share much of their errors, so that odds are less than they seem.
+_NEARLY = 0.75
 # What the odometry states of its turns may be off by, in variance.
 _NOISE = np.logspace(-3, 3, 13)
 # Rounds of expectation and maximisation of the share of true loops; so many loops vote at most.
 _ROUNDS, _VOTERS = 12, 2000
+# The density of a lie's turn; and what is next to nothing.
+_EVEN, _TINY = 1 / (2 * np.pi), 1e-9
+
+# A drift is believed of loops of so many places at least, if it wins as many, if no more than this
+# part of them fits without it, or if the variance of the odometry is so many times as large then.
+_DRIFT_PLACES, _FEW, CALMER = 4, 0.1, 4.0
 
 
 def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
@@ -65,89 +82,213 @@ def corrected(factors: BetweenFactors, rows: Indices, drift: float) -> Array:
     return se2.retract(measured, step)
 
 
-def vote(graph: FactorGraph) -> tuple[float, float]:
+def vote(graph: FactorGraph) -> tuple[float, float, float]:
     """
     Return the drift of the heading [rad/m] that loops agree on, and the ln of its odds.
 
-    Positive where it is likelier than none, and surely than any other: to loops of equally long
-    ways a full turn more on each is the same.
+    The odds are positive where it is likelier than none. Laps that close also close if each has a
+    full turn more: of drifts that are nearly as likely, it is the least. Third comes how far off
+    the likeliest other one is; 0 without.
     """
     rows = np.flatnonzero(~graph.between.is_odometry & ~graph.between.is_absolute)
     if graph.manifold is not se2 or not len(rows):
-        return 0.0, -np.inf
+        return 0.0, -np.inf, 0.0
     rows = rows[:: max(1, len(rows) // _VOTERS)]
-    whole = bridged(graph)
-    chain = odometry_poses(whole)
-    place = places(whole, chain)[0][rows]
-    low, high, Z = (ends[rows] for ends in ends_in_time(graph))
-    way, turned = _along(whole)
-    metres = way[high] - way[low]
-    own = covariance_of(graph.between.sqrt_information[rows])
-    phi = se2.wrap(Z[:, 2] - (chain[high, 2] - chain[low, 2]))
-    weight = 1.0 / np.unique(place, return_inverse=True, return_counts=True)[2][
-        np.unique(place, return_inverse=True)[1]]
-    walk = turned[-1] / max(way[-1], 1e-9) ** 2
-    best = {}
-    for name, usual in (('drift', _USUAL**2), ('none', 0.0)):
-        best[name] = max(
-            _highest(phi, metres, own[:, 2, 2] + q * (turned[high] - turned[low]), weight,
-                     usual + q * walk) for q in _NOISE)
-    value, drift, lead = best['drift']
-    if abs(drift) * way[-1] < np.sqrt(np.median(own[:, 2, 2])):
-        return 0.0, -np.inf  # all of the way, it turns by less than a loop can tell
-    return drift, min(value - best['none'][0], lead - np.log(1 / DOUBT - 1))
+    votes = _votes_of(bridged(graph), rows)
+    none = votes.value(0.0, 0.0)
+    peaks = sorted(((votes.value(drift, _USUAL**2), drift) for drift in votes.peaks()),
+                   reverse=True)
+    nearly = _NEARLY * peaks[0][0]
+    near = [peak for peak in peaks if peak[0] >= nearly]
+    if none >= nearly or not near:
+        return 0.0, -np.inf, 0.0
+    value, drift = min(near, key=lambda peak: abs(peak[1]))
+    return drift, value - none, next((other - drift for _, other in near if other != drift), 0.0)
 
 
-def _along(graph: FactorGraph) -> tuple[Array, Array]:
-    """Return the way to each keyframe [m], and the variance of its turns [rad^2], (n,) each."""
+def explains(told: Growth, as_stated: Growth) -> bool:
+    """
+    Return whether loops need the odometry to be rid of a drift.
+
+    That is, they do not fit without, or only if it is far noisier; or several places are won and
+    it is no noisier, as it would be if lies came in by chance. And the loops are of several
+    places: a lap that closes at one place closes as well if it has a turn more.
+    """
+    loops, before = (np.flatnonzero(state.accepted & state.given.is_loop)
+                     for state in (told, as_stated))
+    if told.given.may_err_as_one(loops, _DRIFT_PLACES):
+        return False
+    calmer = as_stated.noise.variance[0] / told.noise.variance[0]
+    more = won(as_stated, told) - won(as_stated, as_stated)
+    return (len(before) <= _FEW * len(loops) or (calmer >= 1 and more >= _DRIFT_PLACES)
+            or (calmer >= CALMER and 2 * len(loops) > len(before)))
+
+
+def won(places_of: Growth, growth: Growth) -> int:
+    """Return of how many places the loops are that a state accepts."""
+    return len(np.unique(places_of.given.place[growth.accepted & growth.given.is_loop]))
+
+
+def _votes_of(graph: FactorGraph, rows: Indices) -> '_Votes':
+    """Return what some loops, (k,), of a graph without gaps say of its odometry."""
+    chain = odometry_poses(graph)
+    low, high, measured = ends_in_time(graph)
     factors = graph.between
-    rows = np.flatnonzero(factors.is_odometry)
-    at = np.minimum(factors.i, factors.j)[rows]
-    length, variance = np.zeros(graph.n_poses), np.zeros(graph.n_poses)
-    length[at + 1] = np.hypot(factors.measurement[rows, 0], factors.measurement[rows, 1])
-    variance[at + 1] = covariance_of(factors.sqrt_information[rows])[:, 2, 2]
-    return np.cumsum(length), np.cumsum(variance)
+    steps = np.flatnonzero(factors.is_odometry)
+    covariance = covariance_of(factors.sqrt_information)
+    way, noise = np.zeros(graph.n_poses), np.zeros((graph.n_poses, 2))
+    at = np.minimum(factors.i, factors.j)[steps] + 1
+    way[at] = np.hypot(*factors.measurement[steps, :2].T)
+    noise[at] = np.stack((np.trace(covariance[steps, :2, :2], axis1=1, axis2=2) / 2,
+                          covariance[steps, 2, 2]), axis=1)
+    way = np.cumsum(way)
+    place, ends = places(graph, chain)
+    return _Votes(chain, way, noise, low[rows], high[rows], measured[rows], covariance[rows],
+                  _weights(place[rows], ends[rows]),
+                  noise[:, 1].sum() / max(way[-1], _TINY) ** 2)
 
 
-def _highest(phi: Array, metres: Array, variance: Array, weight: Array, prior: float
-             ) -> tuple[float, float, float]:
+def _weights(place: Indices, ends: Array) -> Array:
     """
-    Return the highest ln of likelihood and prior over drifts N(0, prior), and where it is.
+    Return the weight of each loop, (k,): a place has a vote for each stretch that is near.
 
-    And by how much it is above the next peak.
+    place, ends : see `places`
     """
-    centre = 0.0
-    step = _STEP
-    most = min(_MOST, 4 * np.sqrt(prior) + _STEP)
-    lead = np.inf
-    for _ in range(_LEVELS):
-        drift = centre + np.arange(-most, most + step / 2, step)
-        value = _log_likelihood(phi, metres, variance + (metres * step) ** 2 / 12, weight, drift
-                                ) - drift**2 / (2 * prior) - np.log(2 * np.pi * prior) / 2
+    order = np.argsort(place, kind='stable')
+    _, first, number, count = np.unique(place[order], return_index=True, return_inverse=True,
+                                        return_counts=True)
+    long = np.maximum.reduceat(ends[order], first) - np.minimum.reduceat(ends[order], first)
+    weight = np.empty(len(place))
+    weight[order] = np.minimum(1 / count + long.max(axis=1) / (2 * count), 1.0)[number]
+    return weight
+
+
+@dataclass(frozen=True)
+class _Votes:
+    """
+    What k loops say of the odometry.
+
+    chain : (n, 3) poses along the odometry; way : (n,) metres to each; noise : (n, 2) variance of
+    the position and of the heading of the step to each, as stated; low, high : (k,) the ends of
+    each loop; measured : (k, 3) by it; own : (k, 3, 3) its covariance; weight : (k,) of each;
+    walk : the variance of a drift that is but noise.
+    """
+
+    chain: Array
+    way: Array
+    noise: Array
+    low: Indices
+    high: Indices
+    measured: Array
+    own: Array
+    weight: Array
+    walk: float
+
+    def peaks(self) -> Array:
+        """Return the drifts, (p,), near which most of the headings agree, likeliest first."""
+        drift = np.arange(-_MOST, _MOST + _STEP / 2, _STEP)
+        values = [self._by_headings(drift, _STEP, q) for q in _NOISE]
+        value, noise = np.max(values, axis=0), _NOISE[np.argmax(values, axis=0)]
         is_peak = (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:])
-        peaks = np.sort(value[1:-1][is_peak])
-        lead = float(peaks[-1] - peaks[-2]) if len(peaks) > 1 and most > 2 * step else lead
-        centre = float(drift[np.argmax(value)])
-        most = 2 * step
-        step = step / _FINER
-    return float(value.max()), centre, lead
+        at = 1 + np.flatnonzero(is_peak)
+        at = at[np.argsort(-value[at], kind='stable')[:_PEAKS]]
+        return np.array([self._refined(drift[peak], noise[peak]) for peak in at])
+
+    def _refined(self, drift: float, q: float) -> float:
+        """Return where the peak near a drift is, as finely as the longest loop tells."""
+        step = _STEP
+        metres = float((self.way[self.high] - self.way[self.low]).max())
+        while step * metres > _FINE:
+            near = drift + step * np.linspace(-1, 1, 2 * _FINER + 1)
+            step /= _FINER
+            drift = float(near[np.argmax(self._by_headings(near, step, q))])
+        return drift
+
+    def _by_headings(self, drift: Array, step: float, q: float) -> Array:
+        """Return the ln of the likelihood of drifts, (d,), known to a step, by headings alone."""
+        low, high = self.low, self.high
+        metres = self.way[high] - self.way[low]
+        turns = np.cumsum(self.noise[:, 1])
+        variance = self.own[:, 2, 2] + q * (turns[high] - turns[low]) + (metres * step) ** 2 / 12
+        lack = self.measured[:, 2] - (self.chain[high, 2] - self.chain[low, 2])
+        error = se2.wrap(lack - drift[:, None] * metres)
+        density = np.exp(-error**2 / (2 * variance)) / np.sqrt(2 * np.pi * variance)
+        # All around the circle, what is wider than it is even.
+        density = np.maximum(density, np.where(variance > np.pi**2 / 3, _EVEN, 0.0))
+        return _log_likelihood(density / _EVEN, self.weight) - _log_prior(
+            drift, _USUAL**2 + q * self.walk)
+
+    def value(self, drift: float, usual: float) -> float:
+        """
+        Return the ln of the likelihood of a drift, by what loops measure, and of its prior.
+
+        usual : its variance, but for what noise makes
+        """
+        low, high = self.low, self.high
+        heading = self.chain[:, 2] + drift * self.way
+        # As complex numbers: each step is turned by the drift up to it.
+        step = np.diff(self.chain[:, 0] + 1j * self.chain[:, 1]) * np.exp(
+            1j * drift * self.way[:-1])
+        at = np.append(0, np.cumsum(step))
+        off = at[low] + np.exp(1j * heading[low]) * (
+            self.measured[:, 0] + 1j * self.measured[:, 1]) - at[high]
+        turn = se2.wrap(self.measured[:, 2] - (heading[high] - heading[low]))
+        error = np.stack((off.real, off.imag, turn), axis=1)
+        spread = self._spread(np.stack((at.real, at.imag), axis=1))
+        cosine, sine = np.cos(heading[high]), np.sin(heading[high])
+        turned = np.zeros((len(low), 3, 3))
+        turned[:, 0, 0] = turned[:, 1, 1] = cosine
+        turned[:, 1, 0], turned[:, 0, 1], turned[:, 2, 2] = sine, -sine, 1.0
+        own = turned @ self.own @ turned.transpose(0, 2, 1)
+        # Lies claim anything, as far as the way leads.
+        log_room = np.log(2 * np.pi**2 * np.var(at))
+        values = []
+        for q in _NOISE:
+            square, log_det = kernels.prediction.normalise(q * spread + own, error)
+            log_ratio = log_room - (square + log_det + 3 * np.log(2 * np.pi)) / 2
+            values.append(_log_likelihood(np.exp(log_ratio)[None], self.weight)[0]
+                          - _log_prior(drift, usual + q * self.walk))
+        return float(max(values))
+
+    def _spread(self, at: Array) -> Array:
+        """Return the covariances (k, 3, 3) that the steps make, positions being (n, 2)."""
+        position, turn = self.noise.T
+        # Each turn moves the end of a loop by its distance to it, sideways.
+        side = np.column_stack((-at[:, 1], at[:, 0]))
+        first = turn[:, None] * side
+        sums = np.cumsum(np.column_stack((position, turn, first, first[:, :1] * side,
+                                          first[:, 1] * side[:, 1])), axis=0)
+        sums = sums[self.high] - sums[self.low]
+        end, zero, one = side[self.high], sums[:, 1], sums[:, 2:4]
+        spread = np.empty((len(end), 3, 3))
+        spread[:, :2, 2] = spread[:, 2, :2] = zero[:, None] * end - one
+        spread[:, 2, 2] = zero
+        both = np.einsum('ka,kb->kab', end, one)
+        spread[:, :2, :2] = (
+            zero[:, None, None] * np.einsum('ka,kb->kab', end, end) - both
+            - both.transpose(0, 2, 1) + sums[:, [[4, 5], [5, 6]]]
+            + sums[:, 0, None, None] * np.eye(2))
+        return spread
 
 
-def _log_likelihood(phi: Array, metres: Array, variance: Array, weight: Array, drift: Array
-                    ) -> Array:
-    """Return the ln of the likelihood of each drift, the share of true loops at its best."""
-    error = se2.wrap(phi - drift[:, None] * metres)
-    # All around the circle, what is wider than it is even.
-    normal = np.exp(-error**2 / (2 * variance)) / np.sqrt(2 * np.pi * variance)
-    normal = np.maximum(normal, np.where(variance > np.pi**2 / 3, 1 / (2 * np.pi), 0.0))
-    even = 1 / (2 * np.pi)
-    share = np.full((len(drift), 1), 0.5)
+def _log_prior(drift: Array | float, variance: float) -> Array | float:
+    """Return -ln of the density of drifts, normal about none."""
+    return (drift**2 / variance + np.log(2 * np.pi * variance)) / 2
+
+
+def _log_likelihood(ratio: Array, weight: Array) -> Array:
+    """
+    Return the ln of the likelihood of each drift, (d,), the share of true loops at its best.
+
+    ratio : (d, k) how much likelier each loop is true than false
+    """
+    share = np.full((len(ratio), 1), 0.5)
     part = weight / weight.sum()
-    true = np.empty_like(normal)
+    true = np.empty_like(ratio)
     for _ in range(_ROUNDS):
-        # normal / (normal + even (1 - share) / share)
-        np.add(normal, even * (1 / share - 1), out=true)
-        np.divide(normal, true, out=true)
+        # ratio / (ratio + (1 - share) / share)
+        np.add(ratio, 1 / share - 1, out=true)
+        np.divide(ratio, true, out=true)
         share = (true @ part)[:, None].clip(1e-3, 1 - 1e-3)
-    value: Array = np.log(share * normal + (1 - share) * even) @ weight
+    value: Array = np.log(share * ratio + (1 - share)) @ weight
     return value

@@ -291,9 +291,10 @@ class Growth:
         fits = (found.square < self.given.gate(found.freedom)) & self.in_tail[rows]
         refused = self.given.is_loop & ~self.accepted
         refused[rows[fits]] = False
-        # Taken at their word all are noisier than they are, so that more fit by chance: then only
-        # the rest says how many of the rest are false.
-        true = 0 if self.noise.at_their_word else np.count_nonzero(loops)
+        # Taken at their word, or by the noise that one run taught, all are noisier than they are,
+        # so that more fit by chance: then only the rest says how many of the rest are false.
+        true = (0 if self.noise.at_their_word or self.ventured.any()
+                else np.count_nonzero(loops))
         return np.asarray(rows[believable(
             found, self.posterior, self.given.gate, fits, int(true), self.given.place[rows],
             beside_refused(self.given.mates, refused, loops)[rows])])
