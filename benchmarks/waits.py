@@ -72,8 +72,9 @@ def measure(drive: Drive, keyframes: int, rate: float) -> tuple[np.ndarray, np.n
                 backend.add_loop(loop)
             backend.update(_BUDGET)
             taken.append((time.perf_counter() - clock, time.thread_time() - processor))
-            due = max(due + 1 / rate, time.perf_counter())
-            time.sleep(due - time.perf_counter() if due > time.perf_counter() else 0.0)
+            now = time.perf_counter()
+            due = max(due + 1 / rate, now)
+            time.sleep(due - now)
     clocks, processors = np.array(taken).T
     return clocks, processors
 
