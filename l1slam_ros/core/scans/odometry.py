@@ -27,7 +27,7 @@ import numpy as np
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.scans.field import Field
+from l1slam_ros.core.scans.field import REACH, Field
 from l1slam_ros.core.scans.matching import Match, match
 from l1slam_ros.core.scans.points import Points, rotated, transformed
 from l1slam_ros.core.scans.search import search
@@ -38,8 +38,10 @@ _MAP = 4
 # A match is believed where so much of a scan finds the map, no farther from the wheels than the
 # 99.9% quantile of chi-square with 3 degrees of freedom.
 _MATCHED, _GATE = 0.4, 16.27
-# Where so much does, nobody looks whether rays contradict it.
+# Where so much does, nobody looks whether rays contradict it, nor for a better match.
 _MUCH = 0.8
+# The wheels allow so many times their deviation.
+_REACHES = 3.0
 # So much of a scan must find the map where it was searched for, or where rays contradict it a
 # little; no other place may come so near to what a search found.
 _FOUND, _RIVAL = 0.3, 0.85
@@ -167,6 +169,8 @@ class ScanOdometry:
         """Find the pose at a scan from what the wheels expect; return what is to be said."""
         information: Array = np.linalg.inv(predicted).astype(float)
         found, covariance = self._match(expected, expected, information, points)
+        if found.matched < _MUCH and _REACHES**2 * predicted[:2, :2].trace() > REACH**2:
+            found, covariance = self._better(found, covariance, expected, information, points)
         pose = found.pose
         fits = covariance is not None and found.matched >= _MATCHED
         helps = covariance is not None and found.matched >= _FOUND
@@ -193,6 +197,21 @@ class ScanOdometry:
             self._unmatched = 0 if np.isnan(agree) else self._unmatched + 1
             self._pose, self._covariance = expected, predicted
         return ''
+
+    def _better(self, found: Match, covariance: Array | None, expected: Array,
+                information: Array, points: Points) -> tuple[Match, Array | None]:
+        """
+        Return a match, or a better one that was searched for, with its covariance.
+
+        Where the wheels allow more than a match reaches, it may have come to the wrong surface.
+        """
+        searched = self._search(expected, points)
+        if searched is None:
+            return found, covariance
+        other, its = self._match(searched.pose, expected, information, points)
+        if its is not None and (covariance is None or other.matched > found.matched):
+            return other, its
+        return found, covariance
 
     def _match(self, start: Array, expected: Array, information: Array, points: Points
                ) -> tuple[Match, Array | None]:
