@@ -169,8 +169,6 @@ class ScanOdometry:
         """Find the pose at a scan from what the wheels expect; return what is to be said."""
         information: Array = np.linalg.inv(predicted).astype(float)
         found, covariance = self._match(expected, expected, information, points)
-        if found.matched < _MUCH and _REACHES**2 * predicted[:2, :2].trace() > REACH**2:
-            found, covariance = self._better(found, covariance, expected, information, points)
         pose = found.pose
         fits = covariance is not None and found.matched >= _MATCHED
         helps = covariance is not None and found.matched >= _FOUND
@@ -180,14 +178,18 @@ class ScanOdometry:
             pose, covariance = expected, predicted
         agree = 1.0 if fits and found.matched >= _MUCH else self._free_space(pose, points)
         # Where rays look at nothing, they contradict nothing.
-        if (fits and np.isnan(agree)) or (helps and agree >= _AGREE):
+        good = (fits and bool(np.isnan(agree))) or (helps and agree >= _AGREE)
+        # Where the wheels allow more than a match reaches, it may have come to a wrong surface.
+        vague = _REACHES**2 * predicted[:2, :2].trace() > REACH**2
+        if good and (found.matched >= _MUCH or not vague):
             self._take(pose, covariance)
             return ''
         searched = self._search(expected, points)
-        if searched is not None:
+        if searched is not None and (not good or searched.matched > found.matched):
             borne_out = self._free_space(searched.pose, points)
             if borne_out >= np.fmax(agree, _LEAST_AGREE):
-                followed = self._follow_search(searched, borne_out, expected, information, points)
+                against = not good and borne_out >= _AGREE
+                followed = self._follow_search(searched, against, expected, information, points)
                 if followed is not None:
                     return followed
         if fits or agree >= (_LEAST_AGREE if helps else _AGREE):
@@ -197,21 +199,6 @@ class ScanOdometry:
             self._unmatched = 0 if np.isnan(agree) else self._unmatched + 1
             self._pose, self._covariance = expected, predicted
         return ''
-
-    def _better(self, found: Match, covariance: Array | None, expected: Array,
-                information: Array, points: Points) -> tuple[Match, Array | None]:
-        """
-        Return a match, or a better one that was searched for, with its covariance.
-
-        Where the wheels allow more than a match reaches, it may have come to the wrong surface.
-        """
-        searched = self._search(expected, points)
-        if searched is None:
-            return found, covariance
-        other, its = self._match(searched.pose, expected, information, points)
-        if its is not None and (covariance is None or other.matched > found.matched):
-            return other, its
-        return found, covariance
 
     def _match(self, start: Array, expected: Array, information: Array, points: Points
                ) -> tuple[Match, Array | None]:
@@ -229,18 +216,19 @@ class ScanOdometry:
         off = se2.local(self._told[None], pose[None])[0]
         return bool(off @ np.linalg.solve(self._untold, off) > _GATE)
 
-    def _follow_search(self, searched: Match, borne_out: float, expected: Array,
+    def _follow_search(self, searched: Match, against: bool, expected: Array,
                        information: Array, points: Points) -> str | None:
         """
         Believe a search; return what is to be said where the wheels say otherwise.
 
-        None: it is not believed, for the wheels say otherwise, and the rays do not bear it out.
+        against : whether it may be believed against the wheels; None: it is not believed, for they
+        say otherwise
         """
         found, covariance = self._match(searched.pose, expected, information, points)
         if covariance is not None and found.matched >= _FOUND:
             self._take(found.pose, covariance)
             return ''
-        if borne_out < _AGREE:
+        if not against:
             return None
         self._take(searched.pose, np.linalg.inv(_NEAR_PEAK + searched.information) + _SEARCHED)
         self._told, self._untold = self._pose, self._covariance
