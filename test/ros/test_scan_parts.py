@@ -24,15 +24,19 @@ from rclpy.serialization import serialize_message
 
 from l1slam_ros.core.errors import MessageError, OptionError
 from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.measurements import OdometrySample
 from l1slam_ros.core.options import dotted, flatten
+from l1slam_ros.core.running.backend import Backend, BackendOptions
+from l1slam_ros.core.scans.odometry import ScanKeyframes, Step
 from l1slam_ros.core.scans.points import Mount, Scan
 from l1slam_ros.core.scans.submaps import Keyframe
 from l1slam_ros.io.node_options import NodeOptions, read_params_file
 from l1slam_ros.ros.demo import executable
-from l1slam_ros.ros.scans.messages import path_in, scan_in
+from l1slam_ros.ros.scans.messages import path_in, scan_in, whole
 from l1slam_ros.ros.scans.mounting import StaticTransforms
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
 from l1slam_ros.ros.scans.placing import Placing
+from l1slam_ros.ros.scans.scan_odometry import IncrementalOdometry
 from l1slam_ros.ros.scans.scan_queue import ScanQueue
 from l1slam_ros.ros.shell.header import header
 
@@ -113,6 +117,73 @@ def test_time_goes_back_when_two_stamps_say_so():
     queue.add_scan(scan(4 * S))
     assert queue.restarts == 1
     assert queue.take(2.0)[0].stamp == 4 * S
+
+
+def steps(rng, count=40):
+    """Yield stamps and what a front end says of a robot that goes along, a metre in ten scans."""
+    options, keyframe, pose = ScanKeyframes(), np.zeros(3), np.zeros(3)
+    for k in range(count):
+        pose = se2.compose(pose[None], np.array([[0.1, 0.0, 0.02]]))[0] if k else pose
+        moved = se2.between(keyframe[None], pose[None])[0]
+        is_keyframe = not k or np.hypot(*moved[:2]) >= options.translation
+        root = rng.normal(0, 0.02, (3, 3)) * (1, 1, 0.3)
+        covariance = root @ root.T + 1e-5 * np.eye(3)
+        made = Keyframe(k, pose, None, 0, 0.0) if is_keyframe else None
+        yield (k + 1) * S // 10, Step(pose, made, covariance)
+        keyframe = pose if is_keyframe else keyframe
+
+
+def test_the_back_end_has_the_keyframes_of_the_scans_and_what_they_know(rng):
+    shipped = read_params_file_of('backend')
+    backend = Backend(BackendOptions.from_mapping(shipped), 2)
+    told, keyframes, stated = IncrementalOdometry(ScanKeyframes()), [], []
+    for stamp, step in steps(rng):
+        pose, covariance = told.tell(stamp, step, begins=False)
+        assert np.linalg.eigvalsh(covariance).min() > 0
+        backend.add_odometry(OdometrySample(
+            stamp, se2.to_pose3(pose[None])[0], whole(covariance), np.zeros((6, 6)), 'base'))
+        if step.keyframe is not None:
+            keyframes.append(stamp)
+            stated.append(step.covariance)
+    now = backend.snapshot()
+    assert now.stamps.tolist() == keyframes and len(keyframes) > 5
+    factors = now.graph.between
+    found = np.linalg.inv(np.einsum('mki,mkj->mij', factors.sqrt_information[:],
+                                    factors.sqrt_information[:]))
+    for covariance, expected in zip(found, stated[1:], strict=True):
+        # No less than the front end knows, in any direction; random ones that shrink add some.
+        assert np.linalg.eigvalsh(covariance - expected).min() > -1e-9
+
+
+def test_a_steady_covariance_is_stated_as_it_is():
+    told, expected = IncrementalOdometry(ScanKeyframes()), np.diag((4e-4, 1e-4, 1e-5))
+    total, last = np.zeros((3, 3)), np.zeros(3)
+    for k in range(6):
+        pose = np.array([0.1 * k, 0.0, 0.0])
+        made = Keyframe(k, pose, None, 0, 0.0) if k in (0, 5) else None
+        _, covariance = told.tell(k + 1, Step(pose, made, expected), begins=False)
+        if k:
+            Ad = se2.adjoint(se2.between(pose[None], last[None]))[0]
+            total = Ad @ total @ Ad.T + covariance
+        last = pose
+    np.testing.assert_allclose(np.diag(total), np.diag(expected), rtol=0.05)
+
+
+def test_a_new_part_is_a_gap_to_the_back_end():
+    told = IncrementalOdometry(ScanKeyframes())
+    backend = Backend(BackendOptions.from_mapping(read_params_file_of('backend')), 2)
+    for k in range(30):
+        pose = np.array([0.1 * k, 0.0, 0.0])
+        made = Keyframe(k, pose, None, k // 15, 0.0) if k in (0, 5, 10, 15, 20, 25) else None
+        pose, covariance = told.tell((k + 1) * S // 10, Step(pose, made, 1e-4 * np.eye(3)),
+                                     begins=k == 15)
+        backend.add_odometry(OdometrySample(
+            (k + 1) * S // 10, se2.to_pose3(pose[None])[0], whole(covariance), np.zeros((6, 6)),
+            'base'))
+    now = backend.snapshot()
+    assert now.stamps.tolist() == [(k + 1) * S // 10 for k in (0, 5, 10, 15, 20, 25)]
+    assert len(now.graph.between) == 4
+    assert backend.counts().told['new_part'] == 1
 
 
 def transform(parent, child, pose3):

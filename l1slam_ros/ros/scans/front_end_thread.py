@@ -107,8 +107,7 @@ class RunOfScans:
         step = self._front_end.add(scan, wheels)
         begins = self._front_end.keyframes[-1].part != before
         pose, covariance = self._odometry.tell(scan.stamp, step, begins)
-        if covariance is not None:
-            self._publisher.odometry(self._frames.base, scan.stamp, pose, covariance)
+        self._publisher.odometry(self._frames.base, scan.stamp, pose, covariance)
         self._publisher.wheels_frame(self._frames.wheels, scan.stamp, pose, wheels)
         self._placing.add_odometry(scan.stamp, step.pose)
         self._warn(step, begins)

@@ -18,10 +18,6 @@ the front end, and of a stretch that is shorter it is a fair part.
 Where the front end begins a new part, nothing is known of the motion to it, and no covariance that
 the back end believes says so. The frame of `scan_odom` is then moved farther than anything can
 have gone: the back end begins a part, too, which loops may join.
-
-Where a keyframe is due and the front end makes none, for the scan shows nothing known, nothing is
-published for a moment: the back end would make a keyframe there, by the wheels alone, and what the
-next match knows of the way from the keyframe before would be lost.
 """
 
 import numpy as np
@@ -30,12 +26,9 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.measurements import FASTEST
 from l1slam_ros.core.scans.odometry import ScanKeyframes, Step
-from l1slam_ros.io.files import NANOSECONDS
 
 # [m^2, rad^2] Least variance of a message, for a robot that stands.
 _LEAST = 1e-8 * np.eye(3)
-# [ns] After a longer silence the back end doubts what comes.
-_SILENCE = 3 * NANOSECONDS // 2
 # [m] Least shift of a new part; and the shift as a multiple of what anything can move.
 _APART, _FARTHER = 1000.0, 2.0
 
@@ -58,11 +51,9 @@ class IncrementalOdometry:
         self._last: tuple[int, Array] = 0, np.zeros(3)
         self._shift = np.zeros(3)
 
-    def tell(self, stamp: int, step: Step, begins: bool) -> tuple[Array, Array | None]:
+    def tell(self, stamp: int, step: Step, begins: bool) -> tuple[Array, Array]:
         """
         Return a pose (3,) and the covariance (3, 3) of the motion since the one before.
-
-        None in place of a covariance: it is not to be published, see above.
 
         stamp : of the scan [ns]; begins : a part of the run begins with this step
         """
@@ -70,15 +61,12 @@ class IncrementalOdometry:
             return self._begin(stamp, step)
         way, turn = (float(value[0]) for value in se2.motion(
             se2.local(self._keyframe[None], step.pose[None])))
-        done = max(way / self._options.translation, turn / self._options.rotation)
-        if step.keyframe is not None:
-            done = 1.0
-        elif done >= 1.0 and stamp - self._last[0] < _SILENCE:
-            return self._shifted(step.pose), None
+        done = 1.0 if step.keyframe is not None else min(
+            max(way / self._options.translation, turn / self._options.rotation), 1.0)
         moved = se2.between(step.pose[None], self._last[1][None])
         Ad = se2.adjoint(moved)[0]
         before = Ad @ self._stated @ Ad.T
-        increment = _positive(min(done, 1.0) * step.covariance - before) + _LEAST
+        increment = _positive(done * step.covariance - before) + _LEAST
         self._stated = before + increment
         self._last = stamp, step.pose
         if step.keyframe is not None:
