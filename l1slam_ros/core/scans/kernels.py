@@ -46,9 +46,9 @@ def nearest_points(points, origin, resolution, reach, nearest, best):
 
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i4[:, ::1], f8[::1], f8, f8[::1], f8, f8,'
-      ' f8[::1])')
+      ' i8, f8[::1])')
 def normal_equations(points, normals, map_points, map_normals, nearest, origin, resolution, pose,
-                     gate, scale, sums):
+                     gate, scale, together, sums):
     """
     Add up the sums of one Gauss-Newton step of point-to-line matching.
 
@@ -56,11 +56,15 @@ def normal_equations(points, normals, map_points, map_normals, nearest, origin, 
     its Jacobian is taken in the axes of the moving pose. Weights are Cauchy's, 1 / (1 + (e/s)^2).
 
     gate : [m] farther points, and those whose normals differ by more than 45 degrees, do not
-    match; scale : s [m]; sums : (11,) the upper triangle of H by rows (6), g (3), the number of
-    matches, and the sum of weighted squared residuals [m^2]
+    match; scale : s [m]; together : so many points in a row are a group; sums : (17,) the upper
+    triangle of H by rows (6), the same of the sum over groups of their part of g times itself (6),
+    g (3), the number of matches, and the sum of weighted squared residuals [m^2]
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
+    group = np.zeros(3)
     for k in range(len(points)):
+        if k % together == 0:
+            _end_group(group, sums)
         px, py = points[k, 0], points[k, 1]
         x, y = c * px - s * py + pose[0], s * px + c * py + pose[1]
         column = int(np.floor((x - origin[0]) / resolution))
@@ -87,11 +91,25 @@ def normal_equations(points, normals, map_points, map_normals, nearest, origin, 
         sums[3] += w * uy * uy
         sums[4] += w * uy * turn
         sums[5] += w * turn * turn
-        sums[6] += w * ux * e
-        sums[7] += w * uy * e
-        sums[8] += w * turn * e
-        sums[9] += 1.0
-        sums[10] += w * e * e
+        group[0] += w * ux * e
+        group[1] += w * uy * e
+        group[2] += w * turn * e
+        sums[15] += 1.0
+        sums[16] += w * e * e
+    _end_group(group, sums)
+
+
+@compiled
+def _end_group(group, sums):
+    """Add a group's part of g, (3,), and its square to the sums; let another group begin."""
+    at = 6
+    for i in range(3):
+        for j in range(i, 3):
+            sums[at] += group[i] * group[j]
+            at += 1
+        sums[12 + i] += group[i]
+    for i in range(3):
+        group[i] = 0.0
 
 
 @loop('(f8[:, ::1], f8[::1], f8, f8, f8, f8, f8[:, ::1], f8[:, ::1])')

@@ -50,8 +50,11 @@ _SHRINK = 0.75
 _MOST_ITERATIONS = 20
 # [m], [rad] A step that is no step any more.
 _STILL = 1e-4
-# Where the sums have the entries of H.
+# Number of the sums; where they have the entries of H.
+_SUMS = 17
 _SYMMETRIC = np.array(((0, 1, 2), (1, 3, 4), (2, 4, 5)))
+# Points of so many in a row, about half a metre, may be off by one cause.
+_TOGETHER = 10
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,10 @@ class Match:
     """
     Where a scan lies in a map.
 
-    pose : (3,); information : (3, 3) of the matched points alone, in the axes of the pose: H over
-    `KAPPA` and over the mean square of their distances, at least `FINEST` squared; matched : part
-    of the points that found the map; curvature : the least eigenvalue of H over the number of
-    matches, lengths measured in the scan's radius: 0 where a direction is not held
+    pose : (3,); information : (3, 3) of the matched points alone, in the axes of the pose, see
+    `_information`; matched : part of the points that found the map; curvature : the least
+    eigenvalue of H over the number of matches, lengths measured in the scan's radius: 0 where a
+    direction is not held
     """
 
     pose: Array
@@ -82,7 +85,7 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
     pose = start.astype(float)
     gate = widest
     H = np.zeros((3, 3))
-    sums = np.zeros(11)
+    sums = np.zeros(_SUMS)
     radius = float(np.sqrt((xy**2).sum(axis=1).mean())) if len(xy) else 1.0
     units = np.array([1.0, 1.0, 1.0 / max(radius, 0.1)])
     for _ in range(_MOST_ITERATIONS):
@@ -102,19 +105,20 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
         gate = max(gate * _SHRINK, _NARROWEST)
         if narrow and abs(step).max() < _STILL:
             break
-    count = sums[9]
+    count = sums[15]
     curvature = float(np.linalg.eigvalsh(H * np.outer(units, units))[0] / max(count, 1.0))
-    square = max(FINEST**2, sums[10] / max(count, 1.0))
-    return Match(pose, H / (KAPPA * square), count / max(len(xy), 1), curvature)
+    square = max(FINEST**2, sums[16] / max(count, 1.0))
+    information = _information(H, sums[6 + _SYMMETRIC], KAPPA * square)
+    return Match(pose, information, count / max(len(xy), 1), curvature)
 
 
 def _sums(field: Field, xy: Array, normals: Array, pose: Array, gate: float
           ) -> tuple[Array, Array, Array]:
-    sums = np.zeros(11)
+    sums = np.zeros(_SUMS)
     kernels.normal_equations(
         xy, normals, field.xy, field.normals, field.nearest, field.origin, RESOLUTION, pose, gate,
-        _SCALE, sums)
-    return sums[_SYMMETRIC], sums[6:9], sums
+        _SCALE, _TOGETHER, sums)
+    return sums[_SYMMETRIC], sums[12:15], sums
 
 
 def _held(H: Array, g: Array, units: Array) -> tuple[Array, Array]:
@@ -128,3 +132,20 @@ def _held(H: Array, g: Array, units: Array) -> tuple[Array, Array]:
     part = np.maximum(1 - noise / np.maximum(values, 1e-12), 0.0)
     V = axes / units[:, None]
     return (V * (part * values)) @ V.T, V @ (part * (axes.T @ (units * g)))
+
+
+def _information(H: Array, scatter: Array, variance: float) -> Array:
+    """
+    Return the information of matched points, (3, 3): H over a variance [m^2], or less.
+
+    Where neighbours are off together (what has moved, normals of what is bent, a map whose scans
+    disagree) the gradient's covariance is `scatter`, the sum of the squares of its parts, and not
+    the variance times H. Of each direction the greater of both counts.
+
+    Source: White, "Maximum likelihood estimation of misspecified models", 1982; groups: Liang and
+    Zeger, "Longitudinal data analysis using generalized linear models", 1986.
+    """
+    L = np.linalg.cholesky(H + _LEAST)
+    values, axes = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, scatter).T) / variance)
+    root = H @ np.linalg.solve(L.T, axes)
+    return (root / np.maximum(values, 1.0)) @ root.T / variance

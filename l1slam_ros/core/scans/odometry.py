@@ -27,7 +27,7 @@ import numpy as np
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.scans.field import Field
+from l1slam_ros.core.scans.field import REACH, Field
 from l1slam_ros.core.scans.matching import Match, match
 from l1slam_ros.core.scans.points import Points, rotated, transformed
 from l1slam_ros.core.scans.search import search
@@ -38,8 +38,10 @@ _MAP = 4
 # A match is believed where so much of a scan finds the map, no farther from the wheels than the
 # 99.9% quantile of chi-square with 3 degrees of freedom.
 _MATCHED, _GATE = 0.4, 16.27
-# Where so much does, nobody looks whether rays contradict it.
+# Where so much does, nobody looks whether rays contradict it, nor for a better match.
 _MUCH = 0.8
+# The wheels allow so many times their deviation.
+_REACHES = 3.0
 # So much of a scan must find the map where it was searched for, or where rays contradict it a
 # little; no other place may come so near to what a search found.
 _FOUND, _RIVAL = 0.3, 0.85
@@ -176,14 +178,18 @@ class ScanOdometry:
             pose, covariance = expected, predicted
         agree = 1.0 if fits and found.matched >= _MUCH else self._free_space(pose, points)
         # Where rays look at nothing, they contradict nothing.
-        if (fits and np.isnan(agree)) or (helps and agree >= _AGREE):
+        good = (fits and bool(np.isnan(agree))) or (helps and agree >= _AGREE)
+        # Where the wheels allow more than a match reaches, it may have come to a wrong surface.
+        vague = _REACHES**2 * predicted[:2, :2].trace() > REACH**2
+        if good and (found.matched >= _MUCH or not vague):
             self._take(pose, covariance)
             return ''
         searched = self._search(expected, points)
-        if searched is not None:
+        if searched is not None and (not good or searched.matched > found.matched):
             borne_out = self._free_space(searched.pose, points)
             if borne_out >= np.fmax(agree, _LEAST_AGREE):
-                followed = self._follow_search(searched, borne_out, expected, information, points)
+                against = not good and borne_out >= _AGREE
+                followed = self._follow_search(searched, against, expected, information, points)
                 if followed is not None:
                     return followed
         if fits or agree >= (_LEAST_AGREE if helps else _AGREE):
@@ -210,18 +216,19 @@ class ScanOdometry:
         off = se2.local(self._told[None], pose[None])[0]
         return bool(off @ np.linalg.solve(self._untold, off) > _GATE)
 
-    def _follow_search(self, searched: Match, borne_out: float, expected: Array,
+    def _follow_search(self, searched: Match, against: bool, expected: Array,
                        information: Array, points: Points) -> str | None:
         """
         Believe a search; return what is to be said where the wheels say otherwise.
 
-        None: it is not believed, for the wheels say otherwise, and the rays do not bear it out.
+        against : whether it may be believed against the wheels; None: it is not believed, for they
+        say otherwise
         """
         found, covariance = self._match(searched.pose, expected, information, points)
         if covariance is not None and found.matched >= _FOUND:
             self._take(found.pose, covariance)
             return ''
-        if borne_out < _AGREE:
+        if not against:
             return None
         self._take(searched.pose, np.linalg.inv(_NEAR_PEAK + searched.information) + _SEARCHED)
         self._told, self._untold = self._pose, self._covariance

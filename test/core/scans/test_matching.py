@@ -91,3 +91,14 @@ def test_worse_fits_are_less_certain(rng):
     rough = xy + 0.09 * rng.standard_normal(len(xy))[:, None] * normals
     good, bad = match(field, xy, normals, np.zeros(3)), match(field, rough, normals, np.zeros(3))
     assert (np.linalg.eigvalsh(bad.information) < 0.7 * np.linalg.eigvalsh(good.information)).all()
+
+
+def test_neighbours_that_are_off_together_say_less_than_noise(rng):
+    """As much off, either each point by itself, or stretches of wall of more than a metre."""
+    field = Field.of(*surface(HERE, rng))
+    xy, normals = surface(HERE, rng)
+    along_wall = np.arange(len(xy)) // 25 % 2 * 2.0 - 1.0
+    off = 0.04 * np.stack((rng.permutation(along_wall), along_wall))
+    noise, bent = (match(field, xy + each[:, None] * normals, normals, np.zeros(3)).information
+                   for each in off)
+    assert (np.linalg.eigvalsh(bent) < 0.75 * np.linalg.eigvalsh(noise)).all()

@@ -190,6 +190,23 @@ def test_a_metre_backwards_that_the_wheels_count_as_forwards():
     assert {keyframe.part for keyframe in odometry.keyframes} == {0}
 
 
+@pytest.mark.parametrize('seed', [0, 2])
+def test_wheels_that_are_a_quarter_of_a_metre_off_lead_to_no_wrong_wall(seed):
+    """What a match finds from there may be another wall, and what fits better another door."""
+    way = along(THROUGH, 1.0)
+    scans, _ = drive(way, seed, ROOMS, ahead)
+    steps = se2.between(way[:-1], way[1:])
+    far = np.hypot(steps[:, 0], steps[:, 1])
+    steps += np.random.default_rng(seed).normal(0, 0.25, steps.shape) * far[:, None]
+    odometry, pose = ScanOdometry(), np.zeros(3)
+    found = odometry.add(scans[0].stamp, points_of(scans[0]), pose)
+    for scan, step in zip(scans[1:], steps, strict=True):
+        pose = se2.compose(pose[None], step[None])[0]
+        found = odometry.add(scan.stamp, points_of(scan), pose)
+    true = se2.between(way[:1], way[-1:])[0]
+    assert np.hypot(*(found.pose - true)[:2]) < 0.1
+
+
 @pytest.mark.parametrize('seed', [2, 3])
 def test_among_thin_things_it_backs_up_and_the_wheels_say_forwards(seed):
     """Of 40 legs 6 cm thick one scan sees others than the next, and little of its map."""
