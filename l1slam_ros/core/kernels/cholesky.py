@@ -55,9 +55,7 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
 
     Returns the sum of what it read ahead, which is of no use.
     """
-    # Of three and of six numbers a step turns by one and by three. A number that is known when the
-    # loop is compiled; it is not asked of `curvature`, for that takes longer.
-    k, still = len(size), len(size) - len(size) // 2
+    k = len(size)
     for at in range(len(panels)):
         panels[at] = 0.0
     # Keyframes' own blocks are summed up side by side: in the panels they lie far apart, and each
@@ -67,7 +65,6 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
     for f in range(len(blocks)):
         if f % _AHEAD == 0:
             seen += _read_ahead(panels, address[f:f + _AHEAD], width[f:f + _AHEAD], k)
-        bent = f < len(curvature)
         for side in range(2):
             for r in range(k):
                 for c in range(k):
@@ -78,36 +75,48 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
                     for a in range(k):
                         total += blocks[f, side, a, r] * scaled[side, a, c]
                     own[keyframe[f, side], r, c] += total
-            if bent:
-                for r in range(still, k):
-                    for c in range(r + 1):
-                        own[keyframe[f, side], r, c] += (
-                            share * curvature[f, side, r - still, side * k + c])
-        if address[f] < 0:
-            continue
         left = 0 if turned[f] else 1
         right = 1 - left
-        for r in range(k):
-            for c in range(k):
-                total = 0.0
-                for a in range(k):
-                    total += blocks[f, left, a, r] * scaled[right, a, c]
-                panels[address[f] + r * width[f] + c] += total
-        if bent:
-            at = address[f]
-            for r in range(still):
-                for c in range(still, k):
-                    panels[at + r * width[f] + c] += (
-                        share * curvature[f, right, c - still, left * k + r])
-            for r in range(still, k):
+        if address[f] >= 0:
+            for r in range(k):
                 for c in range(k):
-                    panels[at + r * width[f] + c] += (
-                        share * curvature[f, left, r - still, right * k + c])
+                    total = 0.0
+                    for a in range(k):
+                        total += blocks[f, left, a, r] * scaled[right, a, c]
+                    panels[address[f] + r * width[f] + c] += total
+        if f < len(curvature):
+            _add_curvature(own, panels, keyframe[f], address[f], width[f], left, curvature[f],
+                           share, k)
     for v in range(len(corner)):
         for r in range(k):
             for c in range(r + 1):
                 panels[corner[v] + r * stride[v] + c] = own[v, r, c]
     return seen
+
+
+@compiled
+def _add_curvature(own, panels, keyframe, at, width, left, curvature, share, k):
+    """
+    Add a factor's curvature to its keyframes' own blocks, and to the one between, if it has one.
+
+    keyframe : (2,); at, width, left : of its block, see `assemble`; curvature : (2, k // 2, 2 k)
+    """
+    # Of three and of six numbers a step turns by one and by three. A number that is known when the
+    # loop is compiled; it is not asked of `curvature`, for that takes longer.
+    still = k - k // 2
+    for side in range(2):
+        for r in range(still, k):
+            for c in range(r + 1):
+                own[keyframe[side], r, c] += share * curvature[side, r - still, side * k + c]
+    if at < 0:
+        return
+    right = 1 - left
+    for r in range(still):
+        for c in range(still, k):
+            panels[at + r * width + c] += share * curvature[right, c - still, left * k + r]
+    for r in range(still, k):
+        for c in range(k):
+            panels[at + r * width + c] += share * curvature[left, r - still, right * k + c]
 
 
 @compiled

@@ -97,6 +97,8 @@ class SolverThread:
             # From beginning to beginning: an update is a part of its period.
             due = max(due + self._parameters.options.update.period, time.monotonic())
             self._woken.wait(due - time.monotonic())
+            # Woken early it begins now, and the period may have been shortened.
+            due = min(due, time.monotonic())
             # In this order, or a call of `close` in between is lost.
             self._woken.clear()
             if self._closing:
