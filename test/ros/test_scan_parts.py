@@ -308,8 +308,8 @@ def test_the_shipped_file_equals_the_defaults_and_suits_the_back_end():
     backend = read_params_file(SHIPPED)
     front_end = ScanLoopsOptions()
     assert backend.odometry.covariance_source == 'increment'
-    assert (backend.keyframe.translation, backend.keyframe.rotation) == (
-        front_end.keyframe.translation, front_end.keyframe.rotation)
+    assert (backend.keyframe.translation, backend.keyframe.rotation, backend.keyframe.period) == (
+        front_end.keyframe.translation, front_end.keyframe.rotation, front_end.keyframe.period)
     assert backend.odom_frame == front_end.odom_frame != NodeOptions().odom_frame
     comments = ' '.join(line.strip(' #') for line in SHIPPED.read_text().splitlines()
                         if line.lstrip().startswith('#'))

@@ -78,10 +78,16 @@ FLOOR: Array = np.square(np.diag((0.003, 0.002, 0.0002)))
 
 @dataclass(frozen=True)
 class ScanKeyframes(Options):
-    """When a scan is kept."""
+    """When a scan is kept: beyond any one threshold; 0 switches one off; all 0: every scan."""
 
-    translation: float = option(0.5, 'distance from the last keyframe', 'm', 0.01, 1e3)
-    rotation: float = option(0.35, 'turn since the last keyframe', 'rad', 0.01, 1e3)
+    translation: float = option(0.5, 'distance from the last keyframe; 0: off', 'm', 0, 1e3)
+    rotation: float = option(0.35, 'turn since the last keyframe; 0: off', 'rad', 0, 1e3)
+    period: float = option(0.0, 'time since the last keyframe; 0: off', 's', 0, 1e6)
+
+    def done(self, way: float, turn: float, seconds: float) -> float:
+        """Return how much of the motion between two keyframes is done: 1 and more: a new one."""
+        passed = ((way, self.translation), (turn, self.rotation), (seconds, self.period))
+        return max((value / most for value, most in passed if most > 0), default=1.0)
 
 
 @dataclass(frozen=True)
@@ -285,9 +291,9 @@ class ScanOdometry:
         moved = se2.between(last.pose[None], self._pose[None])[0]
         way = float(np.hypot(moved[0], moved[1]))
         covariance = self._covariance + FLOOR
+        done = self._options.done(way, abs(moved[2]), (stamp - last.stamp) * 1e-9)
         # What shows nothing known does not become the map, or all that follows would match it.
-        if self._unmatched or (
-                way < self._options.translation and abs(moved[2]) < self._options.rotation):
+        if self._unmatched or done < 1.0:
             return Step(self._pose, None, covariance, said)
         keyframe = Keyframe(stamp, self._pose, points, last.part, last.travelled + way)
         self._keep(keyframe)

@@ -45,7 +45,8 @@ class IncrementalOdometry:
 
     def __init__(self, options: ScanKeyframes):
         self._options = options
-        self._keyframe: Array | None = None
+        # The pose and the stamp [ns] of the last one.
+        self._keyframe: tuple[Array, int] | None = None
         # Since the last keyframe: the sum of what was stated, at the last pose.
         self._stated = np.zeros((3, 3))
         self._last: tuple[int, Array] = 0, np.zeros(3)
@@ -59,10 +60,11 @@ class IncrementalOdometry:
         """
         if begins or self._keyframe is None:
             return self._begin(stamp, step)
+        pose, since = self._keyframe
         way, turn = (float(value[0]) for value in se2.motion(
-            se2.local(self._keyframe[None], step.pose[None])))
+            se2.local(pose[None], step.pose[None])))
         done = 1.0 if step.keyframe is not None else min(
-            max(way / self._options.translation, turn / self._options.rotation), 1.0)
+            self._options.done(way, turn, (stamp - since) * 1e-9), 1.0)
         moved = se2.between(step.pose[None], self._last[1][None])
         Ad = se2.adjoint(moved)[0]
         before = Ad @ self._stated @ Ad.T
@@ -70,7 +72,7 @@ class IncrementalOdometry:
         self._stated = before + increment
         self._last = stamp, step.pose
         if step.keyframe is not None:
-            self._keyframe = step.pose
+            self._keyframe = step.pose, stamp
             self._stated = np.zeros((3, 3))
         return self._shifted(step.pose), increment
 
@@ -78,7 +80,7 @@ class IncrementalOdometry:
         if self._keyframe is not None:
             seconds = abs(stamp - self._last[0]) * 1e-9
             self._shift = self._shift + (max(_APART, _FARTHER * FASTEST * seconds), 0.0, 0.0)
-        self._keyframe = step.pose
+        self._keyframe = step.pose, stamp
         self._stated = np.zeros((3, 3))
         self._last = stamp, step.pose
         return self._shifted(step.pose), step.covariance

@@ -56,6 +56,15 @@ def test_it_follows_the_robot_where_the_wheels_drift():
     assert all(step.said == '' for step in steps)
 
 
+@pytest.mark.parametrize('options, apart', [
+    (ScanKeyframes(0.0, 0.0, 0.0), 1), (ScanKeyframes(0.0, 0.0, 1.0), 5),
+    (ScanKeyframes(0.0, 0.0, 0.05), 1), (ScanKeyframes(0.0, 100.0, 0.0), 0)])
+def test_a_threshold_of_0_is_off_and_without_any_each_scan_is_a_keyframe(options, apart):
+    steps, _, _ = steps_of(ROUND[:31], odometry=ScanOdometry(options))
+    at = [k for k, step in enumerate(steps) if step.keyframe is not None]
+    assert at == (list(range(0, 31, apart)) if apart else [0])
+
+
 def nis(seeds):
     """Return each component of the normalised innovation of steps squared, its mean, (3,)."""
     squares = []
