@@ -124,12 +124,13 @@ def run(name: str, load: Callable[[], Any], ready: str) -> None:
         leave(_BAD_INPUT if unknown else 1)
     node = None
     code = 0
-    signals.orderly(rclpy.try_shutdown)
     try:
         node = make()
         signals.saving = node.is_saving
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        # Not before: ROS that is shut down in the middle of that complains of what is half made.
+        signals.orderly(rclpy.try_shutdown)
         node.get_logger().info(f'ready: {ready}')
         _spin(executor, node)
     except L1SlamError as error:
