@@ -101,8 +101,7 @@ def _add_curvature(own, panels, keyframe, at, width, left, curvature, share, k):
 
     keyframe : (2,); at, width, left : of its block, see `assemble`; curvature : (2, k // 2, 2 k)
     """
-    # Of three and of six numbers a step turns by one and by three. A number that is known when the
-    # loop is compiled; it is not asked of `curvature`, for that takes longer.
+    # Of three and of six numbers a step turns by one and by three.
     still = k - k // 2
     for side in range(2):
         for r in range(still, k):

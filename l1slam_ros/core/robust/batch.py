@@ -77,7 +77,7 @@ from l1slam_ros.core.robust.judgement import (
     judgement_of,
     listed,
 )
-from l1slam_ros.core.robust.odometry.drift import CALMER, explains, straightened, vote, won
+from l1slam_ros.core.robust.odometry.drift import CALMER, explains, find_drift, straightened, won
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.evidence import REFUSED
@@ -154,10 +154,10 @@ class _Repair:
     def _straightened(self, as_stated: Growth) -> Growth | None:
         """Return the state without a drift that explains the loops, or was taken for noise."""
         if len(as_stated.undecided()) or as_stated.noise.variance[0] > CALMER:
-            voted, odds, rival = vote(self._graph)
-            for straight, told in self._without(voted) if odds > 0 else ():
+            drift, odds, rival = find_drift(self._graph)
+            for straight, told in self._without(drift) if odds > 0 else ():
                 if explains(told, as_stated):
-                    self.drift, self.rival = voted, rival
+                    self.drift, self.rival = drift, rival
                     return straight
         taken = drift_taken_for_noise(as_stated)
         for straight, told in self._without(taken) if taken else ():

@@ -97,13 +97,13 @@ def _with_end(texts: list[str], end: list[str], dtype: np.dtype) -> np.ndarray |
     before = dtype['values'].shape[0] - len(end)
     short = np.dtype([('ids', dtype['ids']), ('values', np.float64, (before,))])
     length = len(_tail(end))
-    heads = _numbers((text[:-length] for text in texts), len(texts), short)
+    begins = _numbers((text[:-length] for text in texts), len(texts), short)
     shared = _numbers([_tail(end)], 1, np.dtype([('values', np.float64, (len(end),))]))
-    if heads is None or shared is None:
+    if begins is None or shared is None:
         return None
     rows = np.empty(len(texts), dtype)
-    rows['ids'] = heads['ids']
-    rows['values'][:, :before] = heads['values']
+    rows['ids'] = begins['ids']
+    rows['values'][:, :before] = begins['values']
     rows['values'][:, before:] = shared['values']
     return rows
 

@@ -110,9 +110,9 @@ def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
     return GraphLines(groups, left_out, lines.remarks, lines.comments)
 
 
-def _alike(texts: list[str], begin: int, head: str) -> int:
-    """Return how many lines from `begin` on start with a head, one after the other."""
-    return next((k for k in range(len(texts) - begin) if not texts[begin + k].startswith(head)),
+def _alike(texts: list[str], begin: int, start: str) -> int:
+    """Return how many lines from `begin` on start alike, one after the other."""
+    return next((k for k in range(len(texts) - begin) if not texts[begin + k].startswith(start)),
                 len(texts) - begin)
 
 

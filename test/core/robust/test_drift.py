@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""A heading that drifts is found by vote, the map is made without it; where none is, none is."""
+"""A heading that drifts is found by loops, the map is made without it; where none is, none is."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from problems import chain_of, graph_of
 
 from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
 from l1slam_ros.core.robust import batch_map
-from l1slam_ros.core.robust.odometry.drift import straightened, vote
+from l1slam_ros.core.robust.odometry.drift import find_drift, straightened
 from l1slam_ros.core.worlds.false_loops import random_false_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
 
@@ -24,8 +24,8 @@ WORLD = careful_world(400, 800)
 
 
 @pytest.mark.parametrize('drift', [DRIFT, -0.02])
-def test_loops_vote_for_the_drift_that_there_is(drift):
-    found, odds, _ = vote(straightened(WORLD.graph, -drift))
+def test_loops_agree_on_the_drift_that_there_is(drift):
+    found, odds, _ = find_drift(straightened(WORLD.graph, -drift))
     assert odds > 0
     assert found == pytest.approx(drift, abs=2e-3)
 
@@ -38,7 +38,7 @@ def test_of_laps_that_are_alike_the_least_drift_is_chosen_and_a_turn_more_on_eac
     chain, back = chain_of(2 * n), np.arange(0, n, 10)
     pairs = np.concatenate((chain, np.column_stack((back, back + n))))
     graph = graph_of(truth, pairs, np.zeros((len(pairs), 3)), np.diag([400.0, 400.0, 4e4]))
-    drift, odds, rival = vote(straightened(graph, -DRIFT))
+    drift, odds, rival = find_drift(straightened(graph, -DRIFT))
     turns = (drift - DRIFT) * metres / (2 * np.pi)
     assert odds > 0 and abs(drift) <= DRIFT + 1e-4
     assert turns == pytest.approx(round(turns), abs=0.02)
@@ -47,13 +47,13 @@ def test_of_laps_that_are_alike_the_least_drift_is_chosen_and_a_turn_more_on_eac
 
 @pytest.mark.parametrize('kind', KINDS_OF_FALSE_LOOPS)
 def test_lies_do_not_hide_it(kind):
-    found, odds, _ = vote(straightened(spoilt(WORLD, kind, 300).graph, -DRIFT))
+    found, odds, _ = find_drift(straightened(spoilt(WORLD, kind, 300).graph, -DRIFT))
     assert odds > 0
     assert found == pytest.approx(DRIFT, abs=2e-3)
 
 
 def test_odometry_that_does_not_drift_is_left_as_it_is():
-    assert abs(vote(WORLD.graph)[0]) < 2e-3
+    assert abs(find_drift(WORLD.graph)[0]) < 2e-3
     bad = spoilt(WORLD, 'random', 400)
     assert batch_map.solve(bad.graph, None, batch_map.SolveOptions()).judgement.drift == 0
 
@@ -62,7 +62,7 @@ def test_what_no_loop_can_tell_over_all_of_the_way_is_no_drift(rng):
     """Of a long way, chance alone prefers some drift of micro-radians to none."""
     world = simulate_world(25_000, 50_000, WorldOptions(), np.random.default_rng(1))
     lies = random_false_loops(world.graph, world.truth, 7_500, rng)
-    assert vote(with_false_loops(world, lies).graph)[1] < 0
+    assert find_drift(with_false_loops(world, lies).graph)[1] < 0
 
 
 @pytest.mark.parametrize('norm', ['l1', 'l2'])

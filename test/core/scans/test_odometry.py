@@ -47,6 +47,16 @@ def steps_of(true, walls=WALLS, seed=0, spoil=None, odometry=None, noise=0.01):
     return steps, wrong, np.array([steps[k].covariance for k in at[1:]])
 
 
+def led(scans, steps, start=(0.0, 0.0, 0.0)):
+    """Return the odometry of scans whose wheels make these steps, and its poses, (n, 3)."""
+    odometry = ScanOdometry()
+    wheels = [np.asarray(start)]
+    for step in steps:
+        wheels.append(se2.compose(wheels[-1][None], step[None])[0])
+    return odometry, np.array([odometry.add(scan.stamp, points_of(scan), pose).pose
+                               for scan, pose in zip(scans, wheels, strict=True)])
+
+
 def test_it_follows_the_robot_where_the_wheels_drift():
     steps, _, _ = steps_of(ROUND)
     poses = np.array([step.pose for step in steps])
@@ -189,13 +199,9 @@ def test_a_metre_backwards_that_the_wheels_count_as_forwards():
     scans, wheels = drive(way, spoil=ahead)
     steps = se2.between(way[:-1], way[1:])
     steps[steps[:, 0] < 0] *= -1
-    odometry, pose = ScanOdometry(), wheels[0]
-    found = odometry.add(scans[0].stamp, points_of(scans[0]), pose)
-    for scan, step in zip(scans[1:], steps, strict=True):
-        pose = se2.compose(pose[None], step[None])[0]
-        found = odometry.add(scan.stamp, points_of(scan), pose)
+    odometry, poses = led(scans, steps, wheels[0])
     true = se2.between(way[:1], way[-1:])[0]
-    assert np.hypot(*(found.pose - true)[:2]) < 0.1
+    assert np.hypot(*(poses[-1] - true)[:2]) < 0.1
     assert {keyframe.part for keyframe in odometry.keyframes} == {0}
 
 
@@ -207,13 +213,9 @@ def test_wheels_that_are_a_quarter_of_a_metre_off_lead_to_no_wrong_wall(seed):
     steps = se2.between(way[:-1], way[1:])
     far = np.hypot(steps[:, 0], steps[:, 1])
     steps += np.random.default_rng(seed).normal(0, 0.25, steps.shape) * far[:, None]
-    odometry, pose = ScanOdometry(), np.zeros(3)
-    found = odometry.add(scans[0].stamp, points_of(scans[0]), pose)
-    for scan, step in zip(scans[1:], steps, strict=True):
-        pose = se2.compose(pose[None], step[None])[0]
-        found = odometry.add(scan.stamp, points_of(scan), pose)
+    poses = led(scans, steps)[1]
     true = se2.between(way[:1], way[-1:])[0]
-    assert np.hypot(*(found.pose - true)[:2]) < 0.1
+    assert np.hypot(*(poses[-1] - true)[:2]) < 0.1
 
 
 @pytest.mark.parametrize('seed', [2, 3])
@@ -227,12 +229,7 @@ def test_among_thin_things_it_backs_up_and_the_wheels_say_forwards(seed):
     scans, _ = drive(way, seed, walls, ahead)
     steps = se2.between(way[:-1], way[1:])
     steps[steps[:, 0] < 0, 0] *= -1
-    wheels = [np.zeros(3)]
-    for step in steps:
-        wheels.append(se2.compose(wheels[-1][None], step[None])[0])
-    odometry = ScanOdometry()
-    found = np.array([odometry.add(scan.stamp, points_of(scan), pose).pose
-                      for scan, pose in zip(scans, wheels, strict=True)])
+    found = led(scans, steps)[1]
     true = se2.between(np.broadcast_to(way[0], way.shape), way)
     assert np.hypot(*(found - true)[:, :2].T).max() < 0.15
 

@@ -17,7 +17,7 @@ between them, says by how much the odometry has turned too little:
 
 the noise normal, of the loop and of q times what the odometry states of its turns; a lie says any
 angle. The share of true loops is found with it (expectation and maximisation). Loops of one place
-have a vote for each stretch of it. Wheels of unequal size, or a gyroscope with an offset, do that.
+count once for each stretch of it. Wheels of unequal size, or a gyroscope with an offset, do that.
 
 Angles are the same after a full turn, and a robot that goes round in laps turns as much all the
 time: lies that say two poses look the same way agree on a drift by which it never turned. So
@@ -29,6 +29,7 @@ Source: ours, by the recorded logs that `test_drift.py` names where they are.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,20 +47,28 @@ from l1slam_ros.core.robust.rounds.growth import Growth
 _USUAL, _MOST = 0.03, 0.18
 # [rad/m] Drifts are looked for so far apart; near so many of the likeliest, so many times as near,
 # until the longest loop tells them apart by no more than so much [rad].
-_STEP, _PEAKS, _FINER, _FINE = 0.0008, 40, 5, 0.02
+_STEP = 0.0008
+_PEAKS = 40
+_FINER, _FINE = 5, 0.02
 # Nearly as likely as the likeliest is a drift, or none, with this part of its odds to all loops
 # being lies: those of a lap share much of their errors, so that odds are less than they seem.
 _NEARLY = 0.75
 # What the odometry states of its turns may be off by, in variance.
 _NOISE = np.logspace(-3, 3, 13)
-# Rounds of expectation and maximisation of the share of true loops; so many loops vote at most.
-_ROUNDS, _VOTERS = 12, 2000
-# The density of a lie's turn; and what is next to nothing.
-_EVEN, _TINY = 1 / (2 * np.pi), 1e-9
+# Rounds of expectation and maximisation of the share of true loops.
+_ROUNDS = 12
+# So many loops are asked at most.
+_ASKED = 2000
+# The density of a lie's turn.
+_EVEN = 1 / (2 * np.pi)
+# What is next to nothing.
+_TINY = 1e-9
 
 # A drift is believed of loops of so many places at least, if it wins as many, if no more than this
 # part of them fits without it, or if the variance of the odometry is so many times as large then.
-_DRIFT_PLACES, _FEW, CALMER = 4, 0.1, 4.0
+_DRIFT_PLACES = 4
+_FEW = 0.1
+CALMER = 4.0
 
 
 def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
@@ -82,7 +91,7 @@ def corrected(factors: BetweenFactors, rows: Indices, drift: float) -> Array:
     return se2.retract(measured, step)
 
 
-def vote(graph: FactorGraph) -> tuple[float, float, float]:
+def find_drift(graph: FactorGraph) -> tuple[float, float, float]:
     """
     Return the drift of the heading [rad/m] that loops agree on, and the ln of its odds.
 
@@ -93,10 +102,10 @@ def vote(graph: FactorGraph) -> tuple[float, float, float]:
     rows = np.flatnonzero(~graph.between.is_odometry & ~graph.between.is_absolute)
     if graph.manifold is not se2 or not len(rows):
         return 0.0, -np.inf, 0.0
-    rows = rows[:: max(1, len(rows) // _VOTERS)]
-    votes = _votes_of(bridged(graph), rows)
-    none = votes.value(0.0, 0.0)
-    peaks = sorted(((votes.value(drift, _USUAL**2), drift) for drift in votes.peaks()),
+    rows = rows[:: max(1, len(rows) // _ASKED)]
+    likelihood = _drift_likelihood(bridged(graph), rows)
+    none = likelihood.value(0.0, 0.0)
+    peaks = sorted(((likelihood.value(drift, _USUAL**2), drift) for drift in likelihood.peaks()),
                    reverse=True)
     nearly = _NEARLY * peaks[0][0]
     near = [peak for peak in peaks if peak[0] >= nearly]
@@ -129,7 +138,7 @@ def won(places_of: Growth, growth: Growth) -> int:
     return len(np.unique(places_of.given.place[growth.accepted & growth.given.is_loop]))
 
 
-def _votes_of(graph: FactorGraph, rows: Indices) -> '_Votes':
+def _drift_likelihood(graph: FactorGraph, rows: Indices) -> '_DriftLikelihood':
     """Return what some loops, (k,), of a graph without gaps say of its odometry."""
     chain = odometry_poses(graph)
     low, high, measured = ends_in_time(graph)
@@ -143,14 +152,14 @@ def _votes_of(graph: FactorGraph, rows: Indices) -> '_Votes':
                           covariance[steps, 2, 2]), axis=1)
     way = np.cumsum(way)
     place, ends = places(graph, chain)
-    return _Votes(chain, way, noise, low[rows], high[rows], measured[rows], covariance[rows],
-                  _weights(place[rows], ends[rows]),
-                  noise[:, 1].sum() / max(way[-1], _TINY) ** 2)
+    return _DriftLikelihood(
+        chain, way, noise, low[rows], high[rows], measured[rows], covariance[rows],
+        _weights(place[rows], ends[rows]), noise[:, 1].sum() / max(way[-1], _TINY) ** 2)
 
 
 def _weights(place: Indices, ends: Array) -> Array:
     """
-    Return the weight of each loop, (k,): a place has a vote for each stretch that is near.
+    Return the weight of each loop, (k,): a place counts once for each stretch that is near.
 
     place, ends : see `places`
     """
@@ -164,9 +173,9 @@ def _weights(place: Indices, ends: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Votes:
+class _DriftLikelihood:
     """
-    What k loops say of the odometry.
+    How likely drifts of the odometry are, by k loops.
 
     chain : (n, 3) poses along the odometry; way : (n,) metres to each; noise : (n, 2) variance of
     the position and of the heading of the step to each, as stated; low, high : (k,) the ends of
@@ -197,25 +206,30 @@ class _Votes:
     def _refined(self, drift: float, q: float) -> float:
         """Return where the peak near a drift is, as finely as the longest loop tells."""
         step = _STEP
-        metres = float((self.way[self.high] - self.way[self.low]).max())
+        metres = float(self._headings[0].max())
         while step * metres > _FINE:
             near = drift + step * np.linspace(-1, 1, 2 * _FINER + 1)
             step /= _FINER
             drift = float(near[np.argmax(self._by_headings(near, step, q))])
         return drift
 
+    @cached_property
+    def _headings(self) -> tuple[Array, Array, Array]:
+        """Return the ways [m], the variances of turns, and what these lack, of loops, (k,)."""
+        low, high = self.low, self.high
+        turns = np.cumsum(self.noise[:, 1])
+        lack = self.measured[:, 2] - (self.chain[high, 2] - self.chain[low, 2])
+        return self.way[high] - self.way[low], turns[high] - turns[low], lack
+
     def _by_headings(self, drift: Array, step: float, q: float) -> Array:
         """Return the ln of the likelihood of drifts, (d,), known to a step, by headings alone."""
-        low, high = self.low, self.high
-        metres = self.way[high] - self.way[low]
-        turns = np.cumsum(self.noise[:, 1])
-        variance = self.own[:, 2, 2] + q * (turns[high] - turns[low]) + (metres * step) ** 2 / 12
-        lack = self.measured[:, 2] - (self.chain[high, 2] - self.chain[low, 2])
+        metres, turns, lack = self._headings
+        variance = self.own[:, 2, 2] + q * turns + (metres * step) ** 2 / 12
         error = se2.wrap(lack - drift[:, None] * metres)
         density = np.exp(-error**2 / (2 * variance)) / np.sqrt(2 * np.pi * variance)
         # All around the circle, what is wider than it is even.
         density = np.maximum(density, np.where(variance > np.pi**2 / 3, _EVEN, 0.0))
-        return _log_likelihood(density / _EVEN, self.weight) - _log_prior(
+        return _log_likelihood(density / _EVEN, self.weight) + _log_prior(
             drift, _USUAL**2 + q * self.walk)
 
     def value(self, drift: float, usual: float) -> float:
@@ -238,7 +252,9 @@ class _Votes:
         cosine, sine = np.cos(heading[high]), np.sin(heading[high])
         turned = np.zeros((len(low), 3, 3))
         turned[:, 0, 0] = turned[:, 1, 1] = cosine
-        turned[:, 1, 0], turned[:, 0, 1], turned[:, 2, 2] = sine, -sine, 1.0
+        turned[:, 1, 0] = sine
+        turned[:, 0, 1] = -sine
+        turned[:, 2, 2] = 1.0
         own = turned @ self.own @ turned.transpose(0, 2, 1)
         # Lies claim anything, as far as the way leads.
         log_room = np.log(2 * np.pi**2 * np.var(at))
@@ -247,7 +263,7 @@ class _Votes:
             square, log_det = kernels.prediction.normalise(q * spread + own, error)
             log_ratio = log_room - (square + log_det + 3 * np.log(2 * np.pi)) / 2
             values.append(_log_likelihood(np.exp(log_ratio)[None], self.weight)[0]
-                          - _log_prior(drift, usual + q * self.walk))
+                          + _log_prior(drift, usual + q * self.walk))
         return float(max(values))
 
     def _spread(self, at: Array) -> Array:
@@ -259,7 +275,9 @@ class _Votes:
         sums = np.cumsum(np.column_stack((position, turn, first, first[:, :1] * side,
                                           first[:, 1] * side[:, 1])), axis=0)
         sums = sums[self.high] - sums[self.low]
-        end, zero, one = side[self.high], sums[:, 1], sums[:, 2:4]
+        end = side[self.high]
+        # The sums of the turns' variances, and of these times what each is to the side.
+        zero, one = sums[:, 1], sums[:, 2:4]
         spread = np.empty((len(end), 3, 3))
         spread[:, :2, 2] = spread[:, 2, :2] = zero[:, None] * end - one
         spread[:, 2, 2] = zero
@@ -272,8 +290,8 @@ class _Votes:
 
 
 def _log_prior(drift: Array | float, variance: float) -> Array | float:
-    """Return -ln of the density of drifts, normal about none."""
-    return (drift**2 / variance + np.log(2 * np.pi * variance)) / 2
+    """Return the ln of the density of drifts, normal about none."""
+    return -(drift**2 / variance + np.log(2 * np.pi * variance)) / 2
 
 
 def _log_likelihood(ratio: Array, weight: Array) -> Array:
