@@ -12,6 +12,8 @@ HALF := $(VENV)/half-installed
 
 # A ROS that the shell has sourced, or another venv's ROS wheels, must not mix with this venv's.
 unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# Without bytecode each process parses a hundred modules: .2 s for a command, in hundreds of tests.
+unexport PYTHONDONTWRITEBYTECODE
 
 # Says what is being installed, and installs it. On a terminal pip shows its progress, in a log it
 # would fill pages. What fails by itself is not half done.
