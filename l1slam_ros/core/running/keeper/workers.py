@@ -25,7 +25,8 @@ from l1slam_ros.core.running.improve import Check
 LOOK = 0.05
 # With this niceness a thread that does not make way gets three quarters of a core that it shares
 # with one that does. With a higher one, on a busy machine, a thread that holds Python's lock would
-# seldom run, and all others would wait for it.
+# seldom run, and all others would wait for it: with 10, beside a process that takes all it can get
+# of the core, updates take longer (p99 170 ms) than where workers do not make way (106).
 _NICE = 5
 
 # A function that is called often during work and raises if the work is to stop.
@@ -159,7 +160,7 @@ class Worker:
             raise error
 
     def _run(self, work: Callable[[], None]) -> None:
-        make_way()  # for updates: where cores are few, these would wait for it
+        make_way()  # for updates, which would wait for it where cores are few
         try:
             work()
             self.failed = False
