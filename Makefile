@@ -28,9 +28,8 @@ endef
 demo: $(STAMP)
 	$(VENV)/bin/python -m l1slam_ros.ros.executables
 
-# Three for two cores: the tests of the node wait for most of their time.
 test: $(TESTS)
-	$(VENV)/bin/python -m pytest -n 3 --dist worksteal
+	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
 
 clean:
 	rm -rf $(VENV) build demo dist install log *.egg-info
