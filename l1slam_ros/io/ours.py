@@ -16,7 +16,8 @@ Which files this program may replace: those that it wrote, recognised by a mark 
     .png, .svg, .pdf  the metadata field for the program; in a .pgm a comment
     bag directory     in each .mcap the field for the library that wrote it
 
-A mark is needed because recordings and graphs of other programs look just the same.
+A mark is needed because recordings and graphs of other programs look just the same. An empty file
+has none: somebody made it for a purpose, or lost what was in it.
 """
 
 import os
@@ -54,7 +55,7 @@ def marked(lines: Iterable[str]) -> Iterator[str]:
 
 def is_ours(path: str | os.PathLike[str]) -> bool:
     """
-    Tell whether this program wrote a file or a bag directory, or the file is empty.
+    Tell whether this program wrote a file or a bag directory.
 
     Raises
     ------
@@ -68,7 +69,7 @@ def is_ours(path: str | os.PathLike[str]) -> bool:
                 file.is_file() and (file.name == _METADATA or _ends(file)[0].startswith(_BAG))
                 for file in files) and any(file.name != _METADATA for file in files)
         first, last = _ends(path)
-    return (not first or first.startswith(_FIRST_LINES)
+    return (first.startswith(_FIRST_LINES)
             or KEYWORD.encode() in first.partition(b'\n')[0]
             or last.endswith(f'\n{MARK}\n'.encode())
             or last.rstrip(b'"}\n').endswith(WROTE.encode())

@@ -19,13 +19,13 @@ from typing import Any, TextIO
 _PATIENCE, _APART = 3.0, 5.0
 
 
-def say(sentence: str) -> None:
+def say(sentence: str, program: str = 'l1slam') -> None:
     """Print one line to standard error, which may be closed, or a file on a full disk."""
     if sys.stderr is None:  # `print` would take standard output, where JSON may be
         return
     line = sentence.replace('\n', '\\n')  # the name of a file may have one in it
     try:
-        print(f'l1slam: {line}', file=sys.stderr, flush=True)
+        print(f'{program}: {line}', file=sys.stderr, flush=True)
     except OSError:
         forget(sys.stderr)
 

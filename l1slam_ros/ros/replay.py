@@ -32,7 +32,7 @@ from l1slam_ros.core.errors import FileError, L1SlamError, OptionError
 from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.reader import BagSummary, bag_summary, read_raw
 from l1slam_ros.io.files import NANOSECONDS
-from l1slam_ros.io.progress import Progress
+from l1slam_ros.io.progress import Progress, say
 from l1slam_ros.ros.shell.arguments import split
 from l1slam_ros.ros.shell.header import header
 from l1slam_ros.ros.threads.failures import reason
@@ -277,7 +277,7 @@ def main() -> int:
     def tell(damage: str) -> None:
         # Once, however often the bag is played.
         if damage not in damages:
-            print(f'replay: {damage}', file=sys.stderr)
+            say(damage, 'replay')
             damages.append(damage)
 
     try:
@@ -286,7 +286,7 @@ def main() -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (L1SlamError, OSError) as error:
-        print(f'replay: {error}', file=sys.stderr)
+        say(str(error), 'replay')
         return _BAD_INPUT
     finally:
         rclpy.try_shutdown()

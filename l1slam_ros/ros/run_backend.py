@@ -113,6 +113,7 @@ def run(name: str, load: Callable[[], Any], ready: str) -> None:
     from rclpy.signals import SignalHandlerOptions
 
     from l1slam_ros.core.errors import L1SlamError
+    from l1slam_ros.io.progress import say
 
     make = load()
     try:
@@ -134,7 +135,7 @@ def run(name: str, load: Callable[[], Any], ready: str) -> None:
         node.get_logger().info(f'ready: {ready}')
         _spin(executor, node)
     except L1SlamError as error:
-        print(f'{name}: {error}', file=sys.stderr)
+        say(str(error), name)
         code = 1
     except Exception:
         # A signal can shut ROS down during any call; the error of that call is not a failure.

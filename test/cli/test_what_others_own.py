@@ -114,6 +114,17 @@ def test_a_graph_of_a_user_stays_as_it_is(capsys, users, tmp_path, lies):
     assert users.read_bytes() != before
 
 
+def test_an_empty_file_of_a_user_stays_empty(capsys, users, tmp_path):
+    for name in 'map.g2o', 'map.tum', 'map.png':
+        output = tmp_path / name
+        output.touch()
+        write = ('plot', users, '--output') if name.endswith('png') else ('convert', users)
+        assert REFUSED in run(capsys, *write, output, code=2)[1]
+        assert output.read_bytes() == b''
+        run(capsys, *write, output, '--force')
+        assert is_ours(output)
+
+
 def test_a_hyphen_is_not_taken_for_a_name(capsys, users, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for command in ('convert', users, '-'), ('solve', users, '--output', '-'):

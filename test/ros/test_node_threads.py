@@ -190,7 +190,7 @@ def test_what_works_behind_makes_way_for_messages(bench):
     b.until(lambda: b.received['/diagnostics'], 'the node is up')
     nice = {thread.name: os.getpriority(os.PRIO_PROCESS, thread.native_id)
             for thread in threading.enumerate()}
-    assert nice['MainThread'] == nice['intake'] < nice['solver'] == nice['services']
+    assert nice['MainThread'] == nice['intake'] == nice['solver'] < nice['services']
 
 
 def test_messages_of_all_topics_are_used_in_the_order_they_came(bench, monkeypatch):

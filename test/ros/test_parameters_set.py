@@ -8,6 +8,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the node that are set while it runs, and lists that are empty."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 pytest.importorskip('rclpy')
@@ -16,6 +19,7 @@ from node_bench import call
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
+from l1slam_ros.core.options import flatten
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.shell.arguments import help_of
 
@@ -23,14 +27,15 @@ from l1slam_ros.ros.shell.arguments import help_of
 def put(b, name, value):
     request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
     (result,) = call(b, 'set_parameters', request, SetParameters).results
-    return result.successful
+    assert result.successful == (not result.reason)
+    return result.reason
 
 
 def test_a_shorter_period_of_the_updates_holds_at_once(bench):
     b = bench(**{'update.period': 3600.0})
     b.drive(0, 3)
     b.until(lambda: b.received['pose'], 'odometry is used')
-    assert put(b, 'update.period', 0.05)
+    assert not put(b, 'update.period', 0.05)
     b.until(lambda: len(b.path().poses) == 3, 'the map is updated')
     b.drive(3, 6)
     b.until(lambda: len(b.path().poses) == 6, 'it is updated again')
@@ -40,7 +45,7 @@ def test_a_shorter_period_of_the_transform_holds_from_the_next_odometry_on(bench
     b = bench(transform_period=3600.0)
     b.drive(0, 1)
     b.until(lambda: b.received['map_to_odom'], 'the transform is published')
-    assert put(b, 'transform_period', 0.05)
+    assert not put(b, 'transform_period', 0.05)
     b.drive(1, 2)
     count = len(b.received['map_to_odom'])
     b.until(lambda: len(b.received['map_to_odom']) > count + 4, 'it is published again and again')
@@ -49,7 +54,20 @@ def test_a_shorter_period_of_the_transform_holds_from_the_next_odometry_on(bench
 @pytest.mark.parametrize('name, value', [
     ('update.period', 0.0), ('update.period', float('nan')), ('transform_period', -1.0)])
 def test_a_period_that_is_none_is_refused(bench, name, value):
-    assert not put(bench(), name, value)
+    reason = put(bench(), name, value)
+    assert name in reason and str(value) in reason
+
+
+def test_what_is_read_at_start_only_is_refused_by_its_name(bench):
+    b = bench()
+    fixed = {name: value for name, (value, meaning) in flatten(NodeOptions()).items()
+             if meaning.fixed}
+    page = (Path(__file__).parents[2] / 'doc' / 'topics_and_parameters.md').read_text()
+    (named,) = re.findall('Read at start only are (.*?):', page, re.DOTALL)
+    assert re.findall('`(.*?)`', named) == sorted(fixed)
+    for name, value in fixed.items():
+        value = list(value) if isinstance(value, tuple) else value
+        assert put(b, name, value) == f'Trying to set a read-only parameter: {name}.'
 
 
 def test_an_empty_list_of_robots_is_the_default(bench):

@@ -194,6 +194,7 @@ def test_replay_is_paced(bag):
 
 @pytest.mark.parametrize('arguments, complaint', [
     (('/no/such/bag',), 'no such file'),
+    (('/no/such\nbag',), '/no/such\\nbag: no such file'),
     ((__file__,), 'does not have the name of a bag'),
 ])
 def test_replay_of_no_bag_is_one_line_and_exit_code_2(arguments, complaint):

@@ -8,21 +8,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Threads with less priority than the one that receives messages."""
 
-import os
-import sys
 import threading
 from collections.abc import Callable
 
-# With this niceness messages get three quarters of a shared core. With a higher one, on a busy
-# machine, a thread that holds Python's lock would seldom run, and messages would wait for it.
-_NICE = 5
+from l1slam_ros.core.running.keeper.workers import make_way
 
 
 def background(name: str, work: Callable[[], None]) -> threading.Thread:
     """Return a thread that does some work with less priority, which its threads inherit."""
     def run() -> None:
-        if sys.platform == 'linux':  # elsewhere it would apply to the whole process
-            os.nice(_NICE)
+        make_way()
         work()
 
     return threading.Thread(target=run, name=name, daemon=True)

@@ -20,7 +20,6 @@ from l1slam_ros.io.compilation import STEPS, fill_cache, load, with_space
 from l1slam_ros.io.free_memory import give_back_freed_memory
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.parameters import NodeParameters
-from l1slam_ros.ros.threads.background import background
 from l1slam_ros.ros.threads.failures import Failures
 
 # [s] Pause after a failed update; doubled at each further failure, up to the second number.
@@ -62,7 +61,9 @@ class SolverThread:
         tell : publishes what is new; called when an update has taken in what has come, and at its
             end, with what it did, None: nothing
         """
-        self._thread = background('solver', lambda: self._work(tell))
+        # With as much priority as messages: an update is short, and its workers have less.
+        self._thread = threading.Thread(
+            target=self._work, args=(tell,), name='solver', daemon=True)
         self._thread.start()
 
     def hurry(self) -> None:

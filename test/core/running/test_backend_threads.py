@@ -9,6 +9,7 @@
 """Threads that meet at the back end: what one of them sees is whole, whatever the others do."""
 
 import os
+import sys
 import threading
 import time
 from dataclasses import fields
@@ -62,6 +63,31 @@ def meanwhile(work):
     thread = threading.Thread(target=work)
     thread.start()
     return thread
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='elsewhere threads have no priority')
+def test_work_behind_makes_way_for_updates(monkeypatch):
+    def nice():
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    def noting(name, carry_out):
+        def noted(*given):
+            of_workers[name] = nice()
+            carry_out(*given)
+
+        return noted
+
+    of_workers = {}
+    for name in 'make_map', 'judge_all':
+        monkeypatch.setattr(work, name, noting(name, getattr(work, name)))
+    with Backend(EVERY) as backend:
+        drive(backend, 0, 3)
+        backend.add_loop(loop(1.0, 3.0, [2, 0, 0], covariance6(1e-2 * np.eye(3))))
+        while backend.update(DEADLINE) is not None:
+            pass
+        updating = nice()
+    assert of_workers.keys() == {'make_map', 'judge_all'}
+    assert min(of_workers.values()) > updating
 
 
 def test_nobody_sees_a_keyframe_without_its_odometry(monkeypatch):
