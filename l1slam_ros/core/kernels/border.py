@@ -125,7 +125,7 @@ def _multiply_ends(others, width, columns, common, product):
 @compiled
 def _ways(first, start, pattern, owner, at, ways):
     """
-    Write the supernodes on the ways from some positions, -1 for none, to the root; return how many.
+    Write the supernodes on the ways from some positions, -1 for none, to the root, and count them.
 
     Each comes after the one above it.
     """
