@@ -224,11 +224,10 @@ def _dot_three(line, length, x, y, z):
 def follow(covariance, parent, turn, noise, product):
     """Write the covariances of all points with a new one that hangs on `parent`, (t, k, k)."""
     last, k = len(product) - 1, len(turn)
-    between, moved = np.empty((k, k)), np.zeros((k, k))
+    moved = np.zeros((k, k))
     for s in range(last):
         if parent >= 0:
-            _write_between(covariance, parent, s, between)
-            _multiply(turn, between, moved)
+            _multiply(turn, _between(covariance, parent, s), moved)
         for r in range(k):
             for c in range(k):
                 product[s, r, c] = moved[c, r]
@@ -240,12 +239,9 @@ def follow(covariance, parent, turn, noise, product):
 
 
 @compiled
-def _write_between(covariance, s, t, between):
-    """Write the covariance of points s and t, (k, k)."""
-    block = covariance[max(s, t) * (max(s, t) + 1) // 2 + min(s, t)]
-    for r in range(len(between)):
-        for c in range(len(between)):
-            between[r, c] = block[r, c] if s <= t else block[c, r]
+def _between(covariance, s, t):
+    """Return the covariance of points s and t, (k, k)."""
+    return covariance[t * (t + 1) // 2 + s] if s <= t else covariance[s * (s + 1) // 2 + t].T
 
 
 @compiled
@@ -272,12 +268,9 @@ def predict(covariance, mean, ends, blocks, factor, right, own_ends, own_blocks,
     points, -1 for none; own_ends, own_blocks : the same of this one; factor, right : F and F^-1
     times the right hand side
     """
-    k, between = len(rows), np.empty(said.shape)
-    for r in range(k):
-        for c in range(rows.shape[1]):
-            rows[r, c] = 0.0
-        for c in range(k):
-            said[r, c] = 0.0
+    k = len(rows)
+    rows[:] = 0.0
+    said[:] = 0.0
     for side in range(2):
         end, own = own_ends[side], own_blocks[side]
         if end < 0:
@@ -285,12 +278,12 @@ def predict(covariance, mean, ends, blocks, factor, right, own_ends, own_blocks,
         for b in range(len(ends)):
             for other in range(2):
                 if ends[b, other] >= 0:
-                    _write_between(covariance, end, ends[b, other], between)
-                    _add_product(own, between, blocks[b, other], rows, b * k)
+                    _add_product(own, _between(covariance, end, ends[b, other]),
+                                 blocks[b, other], rows, b * k)
         for other in range(2):
             if own_ends[other] >= 0:
-                _write_between(covariance, end, own_ends[other], between)
-                _add_product(own, between, own_blocks[other], said, 0)
+                _add_product(own, _between(covariance, end, own_ends[other]),
+                             own_blocks[other], said, 0)
         for r in range(k):
             for c in range(k):
                 expected[r] += own[r, c] * mean[end, c]
@@ -355,14 +348,14 @@ def pull(factor, right, ends, blocks, gradient):
 def move(covariance, mean, gradient, points):
     """Return the steps of some points, (m, k), -1 for none, by what pulls at all of them."""
     t, k = gradient.shape
-    steps, between = np.zeros((len(points), k)), np.empty((k, k))
+    steps = np.zeros((len(points), k))
     for m in range(len(points)):
         if points[m] < 0:
             continue
         for r in range(k):
             steps[m, r] = mean[points[m], r]
         for other in range(t):
-            _write_between(covariance, points[m], other, between)
+            between = _between(covariance, points[m], other)
             for r in range(k):
                 for c in range(k):
                     steps[m, r] += between[r, c] * gradient[other, c]

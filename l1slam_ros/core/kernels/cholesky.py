@@ -16,7 +16,8 @@ three and of six. (Of 3 x 3, the compiler makes code that is half as fast, or wo
 short.)
 
 `size` is k zeros. As a tuple its length is known when a loop is compiled, so that loops over the
-rows of a block are unrolled; as an array it serves blocks of every other size.
+rows of a block are unrolled; as an array it serves blocks of every other size. To factor takes no
+longer without it.
 
 Source: Ng and Peyton, "Block sparse Cholesky algorithms on advanced uniprocessor computers"
 (1993).
