@@ -43,24 +43,22 @@ def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn
     # Where in the columns each position on a way is.
     where, length = np.empty(len(owner), np.int32), 0
     ways = np.empty(len(first) - 1, np.int32)
-    for on in range(_ways(first, start, pattern, owner, solved, ways)):
-        for position in range(first[ways[on]], first[ways[on] + 1]):
+    for s in ways[:_ways(first, start, pattern, owner, solved, ways)]:
+        for position in range(first[s], first[s + 1]):
             where[position] = length
             length += 1
     values = np.zeros((k, length * k))
     for q in range(k):
         values[q, where[last] * k + q] = 1.0
-    s = np.int64(owner[last])
-    while s >= 0:
+    own = ways[:_ways(first, start, pattern, owner, at[t - 1:], ways)]
+    for s in own[::-1]:
         begin = max(first[s], last)
         _climb_panel(panels[offset[s]:offset[s + 1]], stride[s],
                      pattern[start[s]:start[s + 1]], first[s + 1] - first[s], begin - first[s],
                      where, values, where[begin] * k)
-        s = _parent(first, start, pattern, owner, s)
-    columns, left = _along(first, start, pattern, owner, last, where, values)
+    columns, left = _along(first, own, where, values)
     solved[t - 1] = -1
-    for on in range(_ways(first, start, pattern, owner, solved, ways)):
-        s = ways[on]
+    for s in ways[:_ways(first, start, pattern, owner, solved, ways)]:
         _descend_panel(panels[offset[s]:offset[s + 1]], stride[s],
                        pattern[start[s]:start[s + 1]], first[s + 1] - first[s], where, values,
                        where[first[s]] * k)
@@ -79,24 +77,19 @@ def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn
 
 
 @compiled
-def _along(first, start, pattern, owner, last, where, values):
+def _along(first, way, where, values):
     """Return the values on a way to the root, and how many numbers each supernode has left."""
     k, width = len(values), np.int64(0)
     left = np.zeros(len(first) - 1, np.int64)
-    s = np.int64(owner[last])
-    while s >= 0:
+    for s in way:
         width += (first[s + 1] - first[s]) * k
-        s = _parent(first, start, pattern, owner, s)
-    columns, begin = np.empty((k, width)), np.int64(0)
-    s = np.int64(owner[last])
-    while s >= 0:
-        left[s], own = width - begin, where[first[s]] * k
-        size = (first[s + 1] - first[s]) * k
+        left[s] = width
+    columns = np.empty((k, width))
+    for s in way:
+        own, begin = where[first[s]] * k, width - left[s]
         for q in range(k):
-            for c in range(size):
+            for c in range((first[s + 1] - first[s]) * k):
                 columns[q, begin + c] = values[q, own + c]
-        begin += size
-        s = _parent(first, start, pattern, owner, s)
     return columns, left
 
 
@@ -131,8 +124,7 @@ def _ways(first, start, pattern, owner, at, ways):
     """
     seen, count = np.zeros(len(first) - 1, np.bool_), 0
     for p in range(len(at)):
-        low = count
-        s = np.int64(owner[at[p]] if at[p] >= 0 else -1)
+        low, s = count, np.int64(owner[at[p]] if at[p] >= 0 else -1)
         while s >= 0 and not seen[s]:
             seen[s], ways[count] = True, s
             count += 1
@@ -140,8 +132,7 @@ def _ways(first, start, pattern, owner, at, ways):
         high = count - 1
         while low < high:
             ways[low], ways[high] = ways[high], ways[low]
-            low += 1
-            high -= 1
+            low, high = low + 1, high - 1
     return count
 
 
