@@ -351,25 +351,3 @@ def move(covariance, mean, gradient, points):
                 for c in range(k):
                     steps[m, r] += between[r, c] * gradient[other, c]
     return steps
-
-
-@loop('(i8[::1], f8[:, :, ::1], f8[:, ::1])')
-def pull_parents(parent, turn, gradient):
-    """Let what pulls at points, (t, k), pull at what they hang on, too."""
-    for s in range(len(parent) - 1, -1, -1):
-        if parent[s] >= 0:
-            for r in range(gradient.shape[1]):
-                for c in range(gradient.shape[1]):
-                    gradient[parent[s], c] += turn[s, r, c] * gradient[s, r]
-
-
-@loop('(i8[::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1])')
-def move_children(parent, turn, noise, gradient, moved):
-    """Write how far from their means points are that hang on others, (t, k); see `move`."""
-    k = moved.shape[1]
-    for s in range(len(parent)):
-        for r in range(k):
-            for c in range(k):
-                moved[s, r] += noise[s, r, c] * gradient[s, c]
-                if parent[s] >= 0:
-                    moved[s, r] += turn[s, r, c] * moved[parent[s], c]

@@ -54,25 +54,10 @@ def minimum_degree(start, adjacent, limit, stage, order_begun, column_begun, row
     """
     n, done = len(start) - 1, len(order_begun)
     # The lists of nodes by stage and degree.
-    highest = 0
-    for k in range(n):
-        highest = max(highest, stage[k])
-    head = np.empty(n * (1 + highest), np.int32)
-    for at in range(len(head)):
-        head[at] = -1
-    after, before, outside = (np.empty(n, np.int32), np.empty(n, np.int32),
-                              np.empty(n, np.int32))
-    seen, counted = np.empty(n, np.int32), np.empty(n, np.int32)
-    order, column, rows = np.empty(n, np.int32), np.empty(n + 1, np.int64), np.empty(
-        limit, np.int32)
-    for k in range(n):
-        seen[k] = counted[k] = -1
-        outside[k] = 0
-    column[0] = 0
-    for step in range(done):
-        order[step], column[step + 1] = order_begun[step], column_begun[step + 1]
-    for at in range(column[done]):
-        rows[at] = rows_begun[at]
+    head = _heads(stage)
+    after, before, seen, counted = _none(n), _none(n), _none(n), _none(n)
+    outside = np.zeros(n, np.int32)
+    order, column, rows = _resumed(n, limit, order_begun, column_begun, rows_begun)
     place, absorbed = _places(n, order_begun, column, rows)
     start, lists, n_variables, n_elements, degree = _quotient(
         start, adjacent, order_begun, column, rows, place, absorbed)
@@ -106,11 +91,40 @@ def minimum_degree(start, adjacent, limit, stage, order_begun, column_begun, row
 
 
 @compiled
+def _none(n):
+    """Return so many numbers -1."""
+    numbers = np.empty(n, np.int32)
+    for k in range(n):
+        numbers[k] = -1
+    return numbers
+
+
+@compiled
+def _heads(stage):
+    """Return the heads of the lists of nodes by stage and degree, all empty."""
+    highest = 0
+    for k in range(len(stage)):
+        highest = max(highest, stage[k])
+    return _none(len(stage) * (1 + highest))
+
+
+@compiled
+def _resumed(n, limit, order_begun, column_begun, rows_begun):
+    """Return room for order, column and rows, with what has begun at the front."""
+    order, column, rows = np.empty(n, np.int32), np.empty(n + 1, np.int64), np.empty(
+        limit, np.int32)
+    column[0] = 0
+    for step in range(len(order_begun)):
+        order[step], column[step + 1] = order_begun[step], column_begun[step + 1]
+    for at in range(column[len(order_begun)]):
+        rows[at] = rows_begun[at]
+    return order, column, rows
+
+
+@compiled
 def _places(n, order, column, rows):
     """Return the step of each node, -1 if it is to come, and whether its element is absorbed."""
-    place, absorbed = np.empty(n, np.int32), np.zeros(n, np.bool_)
-    for k in range(n):
-        place[k] = -1
+    place, absorbed = _none(n), np.zeros(n, np.bool_)
     for step in range(len(order)):
         place[order[step]] = step
     for step in range(len(order)):
