@@ -55,7 +55,8 @@ def minimum_degree(start, adjacent, limit, stage, order_begun, column_begun, row
     n, done = len(start) - 1, len(order_begun)
     # The lists of nodes by stage and degree.
     head = _heads(stage)
-    after, before, seen, counted = _none(n), _none(n), _none(n), _none(n)
+    after, before = np.empty(n, np.int32), np.empty(n, np.int32)
+    seen, counted = _range(n, -1, 0), _range(n, -1, 0)
     outside = np.zeros(n, np.int32)
     order, column, rows = _resumed(n, limit, order_begun, column_begun, rows_begun)
     place, absorbed = _places(n, order_begun, column, rows)
@@ -91,11 +92,11 @@ def minimum_degree(start, adjacent, limit, stage, order_begun, column_begun, row
 
 
 @compiled
-def _none(n):
-    """Return so many numbers -1."""
+def _range(n, first, step):
+    """Return so many numbers, each a step above the one before, (n,) int32."""
     numbers = np.empty(n, np.int32)
     for k in range(n):
-        numbers[k] = -1
+        numbers[k] = first + step * k
     return numbers
 
 
@@ -105,7 +106,7 @@ def _heads(stage):
     highest = 0
     for k in range(len(stage)):
         highest = max(highest, stage[k])
-    return _none(len(stage) * (1 + highest))
+    return _range(len(stage) * (1 + highest), -1, 0)
 
 
 @compiled
@@ -124,7 +125,7 @@ def _resumed(n, limit, order_begun, column_begun, rows_begun):
 @compiled
 def _places(n, order, column, rows):
     """Return the step of each node, -1 if it is to come, and whether its element is absorbed."""
-    place, absorbed = _none(n), np.zeros(n, np.bool_)
+    place, absorbed = _range(n, -1, 0), np.zeros(n, np.bool_)
     for step in range(len(order)):
         place[order[step]] = step
     for step in range(len(order)):
@@ -261,11 +262,9 @@ def dissect(start, adjacent):
     """
     n = len(start) - 1
     cut, part, level = np.zeros(n, np.int32), np.zeros(n, np.int32), np.empty(n, np.int32)
-    nodes, queue = np.empty(n, np.int32), np.empty(n, np.int32)
+    nodes, queue = _range(n, 0, 1), np.empty(n, np.int32)
     begin, end = np.zeros(n + 2, np.int32), np.empty(n + 2, np.int32)
     depth, count, number, deepest = np.zeros(n + 2, np.int32), 1, 0, 0
-    for k in range(n):
-        nodes[k] = k
     end[0] = n
     while count:
         count -= 1
