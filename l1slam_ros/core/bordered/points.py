@@ -61,13 +61,14 @@ class PointsNow:
         """Return m + C g of all keyframes, old and new, (n + b, k); gradient : g, (t, k)."""
         gradient = gradient.copy()
         points, keyframes = self.old
-        kernels.border.pull_parents(self.parent, self.turn, gradient)
+        kernels.substitution.pull_parents(self.parent, self.turn, gradient)
         right = np.zeros((self.size, gradient.shape[1]))
         right[keyframes] = gradient[points]
         old = self.cholesky.solve(right.ravel()) if len(points) else right
         moved = np.zeros_like(gradient)
         moved[points] = old.reshape(right.shape)[keyframes]
-        kernels.border.move_children(self.parent, self.turn, self.noise, gradient, moved)
+        kernels.substitution.move_children(
+            self.parent, self.turn, self.noise, gradient, moved)
         return np.concatenate((old.reshape(right.shape), (self.mean + moved)[self.new]))
 
 

@@ -36,36 +36,39 @@ def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn
     has none; parent, turn : (t,), (t, k, k), see above; kept : columns of points, one after the
     other; begins : (t,) where those of each are among them, -1 for none
     """
-    t, k = product.shape[:2]
-    solved = np.where(begins < 0, at, -1)
+    t, k = len(product), len(turn[0])
+    solved, last = np.empty(t, np.int64), at[t - 1]
+    for s in range(t):
+        solved[s] = at[s] if begins[s] < 0 else -1
     # Where in the columns each position on a way is.
     where, length = np.empty(len(owner), np.int32), 0
-    for s in _ways(first, start, pattern, owner, solved):
-        where[first[s]:first[s + 1]] = np.arange(length, length + first[s + 1] - first[s])
-        length += first[s + 1] - first[s]
+    ways = np.empty(len(first) - 1, np.int32)
+    for s in ways[:_ways(first, start, pattern, owner, solved, ways)]:
+        for position in range(first[s], first[s + 1]):
+            where[position] = length
+            length += 1
     values = np.zeros((k, length * k))
     for q in range(k):
-        values[q, where[at[t - 1]] * k + q] = 1.0
-    own = _ways(first, start, pattern, owner, at[t - 1:])
-    for s in own:
-        begin = max(first[s], at[t - 1])
+        values[q, where[last] * k + q] = 1.0
+    own = ways[:_ways(first, start, pattern, owner, at[t - 1:], ways)]
+    for s in own[::-1]:
+        begin = max(first[s], last)
         _climb_panel(panels[offset[s]:offset[s + 1]], stride[s],
                      pattern[start[s]:start[s + 1]], first[s + 1] - first[s], begin - first[s],
                      where, values, where[begin] * k)
     columns, left = _along(first, own, where, values)
     solved[t - 1] = -1
-    for s in _ways(first, start, pattern, owner, solved)[::-1]:
+    for s in ways[:_ways(first, start, pattern, owner, solved, ways)]:
         _descend_panel(panels[offset[s]:offset[s + 1]], stride[s],
                        pattern[start[s]:start[s + 1]], first[s + 1] - first[s], where, values,
                        where[first[s]] * k)
     for s in range(t):
         if parent[s] >= 0:
             _multiply(turn[s], product[parent[s]], product[s])
-        elif at[s] < 0:
-            product[s] = 0.0
-        elif s < t - 1 and begins[s] < 0:
-            begin = where[at[s]] * k
-            product[s] = values[:, begin:begin + k].T
+        elif at[s] < 0 or (s < t - 1 and begins[s] < 0):
+            for r in range(k):
+                for c in range(k):
+                    product[s, r, c] = values[c, where[at[s]] * k + r] if at[s] >= 0 else 0.0
         else:
             width, common = _lengths(first, start, pattern, owner, left, owner[at[s]], k)
             others = kept[begins[s]:begins[s] + k * width] if s < t - 1 else columns.ravel()
@@ -76,14 +79,18 @@ def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn
 @compiled
 def _along(first, way, where, values):
     """Return the values on a way to the root, and how many numbers each supernode has left."""
-    (k, end), width = values.shape, 0
-    left, columns = np.zeros(len(first) - 1, np.int64), np.empty(values.shape)
-    for s in way[::-1]:
-        own, size = where[first[s]] * k, (first[s + 1] - first[s]) * k
-        width += size
-        left[s], begin = width, end - width
-        columns[:, begin:begin + size] = values[:, own:own + size]
-    return columns[:, end - width:].copy(), left
+    k, width = len(values), np.int64(0)
+    left = np.zeros(len(first) - 1, np.int64)
+    for s in way:
+        width += (first[s + 1] - first[s]) * k
+        left[s] = width
+    columns = np.empty((k, width))
+    for s in way:
+        own, begin = where[first[s]] * k, width - left[s]
+        for q in range(k):
+            for c in range((first[s + 1] - first[s]) * k):
+                columns[q, begin + c] = values[q, own + c]
+    return columns, left
 
 
 @compiled
@@ -109,24 +116,31 @@ def _multiply_ends(others, width, columns, common, product):
 
 
 @compiled
-def _ways(first, start, pattern, owner, at):
-    """Return the supernodes on the ways from some positions, -1 for none, to the root."""
-    seen, ways = np.zeros(len(first) - 1, np.bool_), np.empty(len(first) - 1, np.int32)
-    count = 0
-    for position in at:
-        s = owner[position] if position >= 0 else -1
+def _ways(first, start, pattern, owner, at, ways):
+    """
+    Write the supernodes on the ways from some positions, -1 for none, to the root, and count them.
+
+    Each comes after the one above it.
+    """
+    seen, count = np.zeros(len(first) - 1, np.bool_), 0
+    for p in range(len(at)):
+        low, s = count, np.int64(owner[at[p]] if at[p] >= 0 else -1)
         while s >= 0 and not seen[s]:
             seen[s], ways[count] = True, s
             count += 1
             s = _parent(first, start, pattern, owner, s)
-    return np.sort(ways[:count])
+        high = count - 1
+        while low < high:
+            ways[low], ways[high] = ways[high], ways[low]
+            low, high = low + 1, high - 1
+    return count
 
 
 @compiled
 def _parent(first, start, pattern, owner, s):
     """Return the supernode above another in the elimination tree, -1: it is a root."""
     below = start[s] + first[s + 1] - first[s]
-    return owner[pattern[below]] if below < start[s + 1] else -1
+    return np.int64(owner[pattern[below]] if below < start[s + 1] else -1)
 
 
 @compiled
@@ -200,17 +214,19 @@ def _dot_three(line, length, x, y, z):
 @loop('(f8[:, :, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, :, ::1])')
 def follow(covariance, parent, turn, noise, product):
     """Write the covariances of all points with a new one that hangs on `parent`, (t, k, k)."""
-    last = len(product) - 1
-    product[last] = noise
-    if parent < 0:
-        product[:last] = 0.0
-        return
-    middle = np.empty_like(turn)
+    last, k = len(product) - 1, len(turn)
+    moved = np.zeros((k, k))
     for s in range(last):
-        _multiply(turn, _between(covariance, parent, s), middle)
-        product[s] = middle.T
-    _multiply(turn, product[parent], middle)
-    product[last] += middle
+        if parent >= 0:
+            _multiply(turn, _between(covariance, parent, s), moved)
+        for r in range(k):
+            for c in range(k):
+                product[s, r, c] = moved[c, r]
+    if parent >= 0:
+        _multiply(turn, product[parent], moved)
+    for r in range(k):
+        for c in range(k):
+            product[last, r, c] = noise[r, c] + moved[r, c]
 
 
 @compiled
@@ -254,11 +270,11 @@ def predict(covariance, mean, ends, blocks, factor, right, own_ends, own_blocks,
             for other in range(2):
                 if ends[b, other] >= 0:
                     _add_product(own, _between(covariance, end, ends[b, other]),
-                                 blocks[b, other], rows[:, b * k:(b + 1) * k])
+                                 blocks[b, other], rows, b * k)
         for other in range(2):
             if own_ends[other] >= 0:
                 _add_product(own, _between(covariance, end, own_ends[other]),
-                             own_blocks[other], said)
+                             own_blocks[other], said, 0)
         for r in range(k):
             for c in range(k):
                 expected[r] += own[r, c] * mean[end, c]
@@ -274,8 +290,8 @@ def predict(covariance, mean, ends, blocks, factor, right, own_ends, own_blocks,
 
 
 @compiled
-def _add_product(left, middle, right, out):
-    """Add left middle right' to out, (k, k) each."""
+def _add_product(left, middle, right, out, at):
+    """Add left middle right', (k, k) each, to columns of out, (k, n), from `at` on."""
     k = len(left)
     for r in range(k):
         for e in range(k):
@@ -283,7 +299,7 @@ def _add_product(left, middle, right, out):
             for c in range(k):
                 total += left[r, c] * middle[c, e]
             for c in range(k):
-                out[r, c] += total * right[c, e]
+                out[r, at + c] += total * right[c, e]
 
 
 @compiled
@@ -327,32 +343,11 @@ def move(covariance, mean, gradient, points):
     for m in range(len(points)):
         if points[m] < 0:
             continue
-        steps[m] = mean[points[m]]
+        for r in range(k):
+            steps[m, r] = mean[points[m], r]
         for other in range(t):
             between = _between(covariance, points[m], other)
             for r in range(k):
                 for c in range(k):
                     steps[m, r] += between[r, c] * gradient[other, c]
     return steps
-
-
-@loop('(i8[::1], f8[:, :, ::1], f8[:, ::1])')
-def pull_parents(parent, turn, gradient):
-    """Let what pulls at points, (t, k), pull at what they hang on, too."""
-    for s in range(len(parent) - 1, -1, -1):
-        if parent[s] >= 0:
-            for r in range(gradient.shape[1]):
-                for c in range(gradient.shape[1]):
-                    gradient[parent[s], c] += turn[s, r, c] * gradient[s, r]
-
-
-@loop('(i8[::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1])')
-def move_children(parent, turn, noise, gradient, moved):
-    """Write how far from their means points are that hang on others, (t, k); see `move`."""
-    k = moved.shape[1]
-    for s in range(len(parent)):
-        for r in range(k):
-            for c in range(k):
-                moved[s, r] += noise[s, r, c] * gradient[s, c]
-                if parent[s] >= 0:
-                    moved[s, r] += turn[s, r, c] * moved[parent[s], c]

@@ -16,7 +16,8 @@ three and of six. (Of 3 x 3, the compiler makes code that is half as fast, or wo
 short.)
 
 `size` is k zeros. As a tuple its length is known when a loop is compiled, so that loops over the
-rows of a block are unrolled; as an array it serves blocks of every other size.
+rows of a block are unrolled; as an array it serves blocks of every other size. To factor takes no
+longer without it.
 
 Source: Ng and Peyton, "Block sparse Cholesky algorithms on advanced uniprocessor computers"
 (1993).
@@ -24,10 +25,12 @@ Source: Ng and Peyton, "Block sparse Cholesky algorithms on advanced uniprocesso
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import ANY_SIZE, compiled, for_sizes
+from l1slam_ros.core.kernels.compiled import ANY_SIZE, compiled, for_sizes, loop
 
 # A pivot that is left with less than this part of its diagonal entry is rounding.
 _SINGULAR = 1e-13
+# As many zeros as a pose has numbers.
+_IN_PLANE, _IN_SPACE = (0,) * 3, (0,) * 6
 # Factors whose blocks are fetched at the same time.
 _AHEAD = 16
 
@@ -144,9 +147,8 @@ def _read_ahead(panels, address, width, k):
     return seen
 
 
-@for_sizes(_PANELS + ', i4[::1], i1[::1], i8, i4[:, ::1], i8[::1]', ANY_SIZE)
-def factorise(panels, first, start, pattern, offset, stride, owner, share, mine, lists, reach,
-              size):
+@loop(f'({_PANELS}, i4[::1], i1[::1], i8, i4[:, ::1], i8[::1], i8)')
+def factorise(panels, first, start, pattern, offset, stride, owner, share, mine, lists, reach, d):
     """
     Turn the lower triangle in `panels` into its Cholesky factor, for one share of the supernodes.
 
@@ -154,10 +156,11 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
 
     owner : (n,) the supernode of each position; share : of each supernode; mine : the one to do
     lists, reach : (2, supernodes) -1 and (supernodes,) 0, kept from one share to the next
+    d : rows of a block
 
     Returns the first position whose pivot is not positive; the number of positions when all are.
     """
-    count, n, d = len(first) - 1, first[-1], len(size)
+    count, n = len(first) - 1, first[-1]
     local = np.empty(n, np.int64)
     tallest = d * _begin_share(reach, start, pattern, owner, share, mine, lists)
     place, target = np.empty(tallest, np.int64), np.empty(tallest, np.int64)
@@ -177,14 +180,14 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
             inner = (first[source + 1] - first[source]) * d
             top = offset[source] + reach[source] * d * stride[source]
             columns = _within(rows, first[s + 1])
-            for k in range(len(rows)):
-                for a in range(d):
+            # Row by row of the blocks: a loop over so few rows takes longer than what it does.
+            for a in range(d):
+                for k in range(len(rows)):
                     place[k * d + a] = local[rows[k]] + a * stride[s]
-            for k in range(columns):
-                for a in range(d):
+                for k in range(columns):
                     target[k * d + a] = (rows[k] - first[s]) * d + a
             _subtract(panels[top:], stride[source], inner, len(rows) * d, columns * d, panels,
-                      place, target, size)
+                      place, target)
             reach[source] += columns
             _enqueue(source, reach, start, pattern, owner, share, mine, lists)
             source = next_source
@@ -233,7 +236,7 @@ def _enqueue(source, reach, start, pattern, owner, share, mine, lists):
 
 
 @compiled
-def _subtract(source, stride, inner, height, columns, panels, place, target, size):
+def _subtract(source, stride, inner, height, columns, panels, place, target):
     """
     Subtract products of a source's rows, from `top` on, from the panel that they belong to.
 
@@ -247,8 +250,13 @@ def _subtract(source, stride, inner, height, columns, panels, place, target, siz
         for r in range(c, height, 2):
             r1 = min(r + 1, height - 1)
             left = source[r * stride:r * stride + inner], source[r1 * stride:r1 * stride + inner]
-            # Most panels of sparse graphs are as wide as a block.
-            tile = _tile(left, right, size) if inner == len(size) else _tile(left, right, left[0])
+            # Most panels of sparse graphs are as wide as a block of a pose.
+            if inner == 3:
+                tile = _tile(left, right, _IN_PLANE)
+            elif inner == 6:
+                tile = _tile(left, right, _IN_SPACE)
+            else:
+                tile = _tile(left, right, left[0])
             _write(panels[place[r]:], target[c], target[c1], target[c2], c1 > c, c2 > c1, tile[0])
             if r1 > r:
                 _write(panels[place[r1]:], target[c], target[c1], target[c2], c1 > c, c2 > c1,

@@ -23,7 +23,7 @@ overlap. K is a tuple of k zeros; its length is a constant to the compiler, an a
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled, for_sizes
+from l1slam_ros.core.kernels.compiled import compiled, for_sizes, loop
 
 # One cache line of single precision. Below 16 the loop vectoriser takes a loop for a short one,
 # where it does not check that arrays are apart, and gives up.
@@ -34,14 +34,14 @@ _UNMEASURED = 1e-12
 _SIZES = tuple(f'UniTuple(i8, {k})' for k in (1, 2, 3))
 
 
-@for_sizes('i8[:, ::1], f8[:, :, :, ::1], i8', plane=_SIZES)
-def scale(keyframe, blocks, size, K):
+@loop('(i8[:, ::1], f8[:, :, :, ::1], i8)')
+def scale(keyframe, blocks, size):
     """
     Return the blocks in scaled unknowns (m, 2, k, k), and R_v^-1 of each keyframe.
 
     (size + 1, k, k), the last one zero: what is held fixed has no unknowns.
     """
-    k = len(K)
+    k = blocks.shape[3]
     inverse, scaled = np.zeros((size + 1, k, k)), np.empty_like(blocks)
     for f in range(len(keyframe)):
         for side in range(2):
@@ -51,8 +51,10 @@ def scale(keyframe, blocks, size, K):
                     for r in range(k):
                         total[a, b] += 2 * block[r, a] * block[r, b]
     for v in range(size):
-        _invert_root(inverse[v], K)
-    inverse[size] = 0.0
+        _invert_root(inverse[v])
+    for a in range(k):
+        for b in range(k):
+            inverse[size, a, b] = 0.0
     for f in range(len(keyframe)):
         for side in range(2):
             block, factor = blocks[f, side], inverse[keyframe[f, side]]
@@ -66,9 +68,9 @@ def scale(keyframe, blocks, size, K):
 
 
 @compiled
-def _invert_root(gram, K):
+def _invert_root(gram):
     """Turn R'R into R^-1, R upper triangular, a little more than R'R where nothing is measured."""
-    k, trace = len(K), 0.0
+    k, trace = len(gram), 0.0
     for a in range(k):
         trace += gram[a, a]
     for a in range(k):

@@ -54,18 +54,14 @@ def minimum_degree(start, adjacent, limit, stage, order_begun, column_begun, row
     """
     n, done = len(start) - 1, len(order_begun)
     # The lists of nodes by stage and degree.
-    stages = 1 + (stage.max() if n else 0)
-    head = np.full(n * stages, -1, np.int32)
+    head = _heads(stage)
     after, before = np.empty(n, np.int32), np.empty(n, np.int32)
-    seen, counted = np.full(n, -1, np.int32), np.full(n, -1, np.int32)
+    seen, counted = _range(n, -1, 0), _range(n, -1, 0)
     outside = np.zeros(n, np.int32)
-    order, column, rows = np.empty(n, np.int32), np.empty(n + 1, np.int64), np.empty(
-        limit, np.int32)
-    order[:done], column[:done + 1] = order_begun, column_begun
-    rows[:column[done]] = rows_begun[:column[done]]
-    place, absorbed = _places(n, order[:done], column, rows)
+    order, column, rows = _resumed(n, limit, order_begun, column_begun, rows_begun)
+    place, absorbed = _places(n, order_begun, column, rows)
     start, lists, n_variables, n_elements, degree = _quotient(
-        start, adjacent, order[:done], column, rows, place, absorbed)
+        start, adjacent, order_begun, column, rows, place, absorbed)
     for k in range(n):
         if place[k] < 0:
             _put(head, after, before, k, stage[k] * n + degree[k])
@@ -96,9 +92,40 @@ def minimum_degree(start, adjacent, limit, stage, order_begun, column_begun, row
 
 
 @compiled
+def _range(n, first, step):
+    """Return so many numbers, each a step above the one before, (n,) int32."""
+    numbers = np.empty(n, np.int32)
+    for k in range(n):
+        numbers[k] = first + step * k
+    return numbers
+
+
+@compiled
+def _heads(stage):
+    """Return the heads of the lists of nodes by stage and degree, all empty."""
+    highest = 0
+    for k in range(len(stage)):
+        highest = max(highest, stage[k])
+    return _range(len(stage) * (1 + highest), -1, 0)
+
+
+@compiled
+def _resumed(n, limit, order_begun, column_begun, rows_begun):
+    """Return room for order, column and rows, with what has begun at the front."""
+    order, column, rows = np.empty(n, np.int32), np.empty(n + 1, np.int64), np.empty(
+        limit, np.int32)
+    column[0] = 0
+    for step in range(len(order_begun)):
+        order[step], column[step + 1] = order_begun[step], column_begun[step + 1]
+    for at in range(column[len(order_begun)]):
+        rows[at] = rows_begun[at]
+    return order, column, rows
+
+
+@compiled
 def _places(n, order, column, rows):
     """Return the step of each node, -1 if it is to come, and whether its element is absorbed."""
-    place, absorbed = np.full(n, -1, np.int32), np.zeros(n, np.bool_)
+    place, absorbed = _range(n, -1, 0), np.zeros(n, np.bool_)
     for step in range(len(order)):
         place[order[step]] = step
     for step in range(len(order)):
@@ -235,9 +262,10 @@ def dissect(start, adjacent):
     """
     n = len(start) - 1
     cut, part, level = np.zeros(n, np.int32), np.zeros(n, np.int32), np.empty(n, np.int32)
-    nodes, queue = np.arange(n).astype(np.int32), np.empty(n, np.int32)
-    begin, end = np.zeros(n + 2, np.int32), np.full(n + 2, n, np.int32)
+    nodes, queue = _range(n, 0, 1), np.empty(n, np.int32)
+    begin, end = np.zeros(n + 2, np.int32), np.empty(n + 2, np.int32)
     depth, count, number, deepest = np.zeros(n + 2, np.int32), 1, 0, 0
+    end[0] = n
     while count:
         count -= 1
         low, high, below = begin[count], end[count], depth[count] + 1

@@ -34,12 +34,20 @@ def gather(keyframe, blocks, y, product):
     k, to = product.shape[1], product.ravel()
     z = np.empty(k * SAMPLES)
     for f in range(len(blocks)):
-        z[:] = y[f].ravel()
+        _write_sample(y[f], z)
         for side in range(2):
             J, at = blocks[f, side], keyframe[f, side] * k
             for c in range(0, k, 3):
                 for r in range(0, k, 3):
                     _add(z, r, J[r:r + 3, c:c + 3].T, 1.0, to, at + c)
+
+
+@compiled
+def _write_sample(y, z):
+    """Write whole numbers, (k, q), as doubles, (k q,)."""
+    for r in range(len(y)):
+        for t in range(SAMPLES):
+            z[r * SAMPLES + t] = y[r, t]
 
 
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i4[::1], f8[:, :, ::1])')
@@ -122,9 +130,10 @@ def left_over(keyframe, blocks, x, y):
     k, steps = x.shape[1], x.ravel()
     moment, d = np.empty((len(blocks), k, k)), np.empty(k * SAMPLES)
     for f in range(len(blocks)):
-        d[:] = 0.0
         if f < len(y):
-            d[:] = y[f].ravel()
+            _write_sample(y[f], d)
+        else:
+            d[:] = 0.0
         _add_moved(keyframe[f], blocks[f], steps, -1.0, d, 0)
         for r in range(k):
             one = d[r * SAMPLES:(r + 1) * SAMPLES]
@@ -139,7 +148,7 @@ def left_over(keyframe, blocks, x, y):
 @loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1])')
 def moved(keyframe, blocks, x):
     """Return A x of each factor and sample, (m, k, q)."""
-    k, steps, d = x.shape[1], x.ravel(), np.zeros((len(blocks), *x.shape[1:]))
+    k, steps, d = x.shape[1], x.ravel(), np.zeros((len(blocks), x.shape[1], SAMPLES))
     product = d.ravel()
     for f in range(len(blocks)):
         _add_moved(keyframe[f], blocks[f], steps, 1.0, product, f * k)
@@ -210,10 +219,12 @@ def normalise_pairs(covariance, residual, shared, first, second):
     m, k = residual.shape
     square, log_det = np.empty(len(first)), np.empty(len(first))
     own, logs, u = np.empty(m), np.empty(m), np.empty((m, k))
-    factor, whole = covariance.copy(), np.empty((m, k))
+    factor, whole = np.empty(covariance.shape), np.empty((m, k))
     for f in range(m):
         for r in range(k):
             whole[f, r] = covariance[f, r, r]
+            for c in range(k):
+                factor[f, r, c] = covariance[f, r, c]
         own[f], logs[f] = _normalised(factor[f], whole[f], residual[f], u[f])
     # Of the second one what the first one does not explain.
     W, C, left, unused = np.empty((k, k)), np.empty((k, k)), np.empty(k), np.empty(k)

@@ -178,10 +178,12 @@ def halves(first, start, pattern):
     descendants on both are 2. Of all cuts the one that takes least time.
     """
     count = len(first) - 1
-    owner, lowest = np.empty(first[count], np.int64), np.arange(count + 1)
+    owner, lowest = np.empty(first[count], np.int64), np.empty(count, np.int64)
     own, crossing = np.empty(count), np.zeros(count + 2)
     for s in range(count):
-        owner[first[s]:first[s + 1]] = s
+        lowest[s] = s
+        for column in range(first[s], first[s + 1]):
+            owner[column] = s
         width, height = first[s + 1] - first[s], start[s + 1] - start[s]
         own[s] = width * (height - width / 2.0) ** 2
     whole = 0.0
@@ -216,7 +218,9 @@ def untouched(start, adjacent, order, column, rows):
     column stays that has all of its node's neighbours, if all below it in the elimination tree do.
     """
     n, old = len(start) - 1, len(order)
-    place, seen = np.full(n, old, np.int32), np.full(n, -1, np.int32)
+    place, seen = np.empty(n, np.int32), np.empty(n, np.int32)
+    for k in range(n):
+        place[k], seen[k] = old, -1
     for step in range(old):
         place[order[step]] = step
     touched = np.zeros(old + 1, np.bool_)
@@ -242,7 +246,8 @@ def untouched(start, adjacent, order, column, rows):
         step = kept[at]
         own_order[at] = order[step]
         own_column[at + 1] = own_column[at] + column[step + 1] - column[step]
-        own_rows[own_column[at]:own_column[at + 1]] = rows[column[step]:column[step + 1]]
+        for k in range(column[step + 1] - column[step]):
+            own_rows[own_column[at] + k] = rows[column[step] + k]
     return own_order, own_column, own_rows
 
 
@@ -271,10 +276,10 @@ def block_addresses(keyframe, position, first, start, pattern, offset, stride, k
         s = owner[column]
         own[v] = stride[s]
         corner[v] = offset[s] + (column - first[s]) * k * (own[v] + 1)
-    address, width = np.full(m, -1), np.zeros(m, np.int64)
-    turned = np.zeros(m, np.bool_)
+    address, width, turned = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m, np.bool_)
     for f in range(m):
         i, j = keyframe[f, 0], keyframe[f, 1]
+        address[f], width[f], turned[f] = -1, 0, False
         if i < n and j < n:
             turned[f] = position[i] > position[j]
             row, v = (position[i], j) if turned[f] else (position[j], i)

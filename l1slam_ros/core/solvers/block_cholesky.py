@@ -250,7 +250,7 @@ class BlockCholesky:
         def share(mine: int) -> int:
             return kernels.cholesky.factorise(
                 layout.panels, *layout.shape, pattern.owner, shares, mine, lists, reach,
-                layout.size)
+                len(layout.size))
 
         return min(*_at_once(share), share(2)) if shared else share(0)
 

@@ -70,8 +70,7 @@ def scaled_system(system: LinearSystem) -> tuple[LinearSystem, Array]:
 
     x = R_v^-1 x_scaled of each keyframe; one without factors keeps its own scale.
     """
-    scaled, inverse = kernels.halpern.scale(
-        system.keyframe, system.blocks, system.size, (0,) * system.block_size)
+    scaled, inverse = kernels.halpern.scale(system.keyframe, system.blocks, system.size)
     return replace(system, blocks=scaled), inverse[:-1]
 
 
