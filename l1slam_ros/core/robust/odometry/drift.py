@@ -7,11 +7,11 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A heading that drifts: how far each metre of the odometry turns, by a vote of the loops.
+A heading that drifts: how far each metre of the odometry turns, as far as loops agree on it.
 
-In: a graph in the plane, of whose loops nothing is believed yet. Out: the drift d [rad/m] that
-they agree on, and how sure that is. A true loop from keyframe i to j, with s metres of way
-between them, says by how much the odometry has turned too little:
+In: a graph in the plane, of whose loops nothing is believed yet. Out: the drifts d [rad/m] that
+they may agree on, and which one leads to the likeliest map. A true loop from keyframe i to j, with
+s metres of way between them, says by how much the odometry has turned too little:
 
     phi = wrap(z_theta - (theta_j - theta_i)) = d s + noise,
 
@@ -21,9 +21,11 @@ count once for each stretch of it. Wheels of unequal size, or a gyroscope with a
 
 Angles are the same after a full turn, and a robot that goes round in laps turns as much all the
 time: lies that say two poses look the same way agree on a drift by which it never turned. So
-angles only propose drifts. Which one it is, positions decide, with the covariance that the noise
-of all steps between makes of angle and position. Laps may close with a turn more on each even so:
-of drifts that are nearly as likely the least one is taken, and the map is doubtful.
+angles only propose drifts. Which ones may be, positions decide, with the covariance that the noise
+of all steps between makes of angle and position. Laps may close with a turn more on each even so,
+and loops of two laps share most of their errors, which is not counted here. So a map is made by
+each of these drifts, and the one that wins most places with the least noise is taken (`likeliest`).
+Where another one is nearly as likely, it is doubtful.
 
 Source: ours, by the recorded logs that `test_drift.py` names where they are.
 """
@@ -50,9 +52,10 @@ _USUAL, _MOST = 0.03, 0.18
 _STEP = 0.0008
 _PEAKS = 40
 _FINER, _FINE = 5, 0.02
-# Nearly as likely as the likeliest is a drift, or none, with this part of its odds to all loops
-# being lies: those of a lap share much of their errors, so that odds are less than they seem.
-_NEARLY = 0.75
+# Nearly as likely as the likeliest is none with this part of its odds to all loops being lies, and
+# worth a look another drift: loops of a lap share much of their errors, so that odds are less than
+# they seem.
+_NONE, _ANOTHER = 0.75, 0.5
 # What the odometry states of its turns may be off by, in variance.
 _NOISE = np.logspace(-3, 3, 13)
 # Rounds of expectation and maximisation of the share of true loops.
@@ -64,11 +67,14 @@ _EVEN = 1 / (2 * np.pi)
 # What is next to nothing.
 _TINY = 1e-9
 
-# A drift is believed of loops of so many places at least, if it wins as many, if no more than this
-# part of them fits without it, or if the variance of the odometry is so many times as large then.
+# A drift that is likelier by no more than so many places are worth has a rival.
+_RIVAL_PLACES = 2
+# A drift is believed of loops of so many places at least, if it is likelier by what these are
+# worth, or if no more than this part of them fits without it.
 _DRIFT_PLACES = 4
 _FEW = 0.1
-CALMER = 4.0
+# Odometry whose variance is so many times what it states may drift.
+NOISY = 4.0
 
 
 def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
@@ -91,46 +97,92 @@ def corrected(factors: BetweenFactors, rows: Indices, drift: float) -> Array:
     return se2.retract(measured, step)
 
 
-def find_drift(graph: FactorGraph) -> tuple[float, float, float]:
+def likely_drifts(graph: FactorGraph) -> Array:
     """
-    Return the drift of the heading [rad/m] that loops agree on, and the ln of its odds.
+    Return the drifts of the heading [rad/m] that loops agree on, (p,), the likeliest first.
 
-    The odds are positive where it is likelier than none. Laps that close also close if each has a
-    full turn more: of drifts that are nearly as likely, it is the least. Third comes how far off
-    the likeliest other one is; 0 without.
+    Laps that close also close if each has a full turn more: several may be worth a look. There
+    are none where loops are nearly as likely without a drift.
     """
     rows = np.flatnonzero(~graph.between.is_odometry & ~graph.between.is_absolute)
     if graph.manifold is not se2 or not len(rows):
-        return 0.0, -np.inf, 0.0
+        return np.zeros(0)
     rows = rows[:: max(1, len(rows) // _ASKED)]
     likelihood = _drift_likelihood(bridged(graph), rows)
-    none = likelihood.value(0.0, 0.0)
-    peaks = sorted(((likelihood.value(drift, _USUAL**2), drift) for drift in likelihood.peaks()),
-                   reverse=True)
-    nearly = _NEARLY * peaks[0][0]
-    near = [peak for peak in peaks if peak[0] >= nearly]
-    if none >= nearly or not near:
-        return 0.0, -np.inf, 0.0
-    value, drift = min(near, key=lambda peak: abs(peak[1]))
-    return drift, value - none, next((other - drift for _, other in near if other != drift), 0.0)
+    drifts = likelihood.peaks()
+    values = np.array([likelihood.value(drift, _USUAL**2) for drift in drifts])
+    most = values.max()
+    if likelihood.value(0.0, 0.0) >= _NONE * most:
+        return np.zeros(0)
+    order = np.argsort(-values, kind='stable')
+    near: Array = drifts[order[values[order] >= _ANOTHER * most]]
+    return near
+
+
+@dataclass(frozen=True)
+class Straight:
+    """
+    What odometry without a drift leads to.
+
+    drift : it [rad/m]; found, told : the states with the noise as it was found, and where all may
+    be as noisy as they say.
+    """
+
+    drift: float
+    found: Growth
+    told: Growth
+
+    def log_odds(self, other: 'Straight') -> float:
+        """Return the ln of its odds against another drift, by what they lead to."""
+        usual = _log_prior(self.drift, _USUAL**2) - _log_prior(other.drift, _USUAL**2)
+        return float(usual) + log_odds(self.told, other.told)
+
+
+def likeliest(some: list[Straight]) -> tuple[Straight | None, float]:
+    """Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0."""
+    best = None
+    for straight in some:
+        if not best or straight.log_odds(best) > 0:
+            best = straight
+    rivals = [(best.log_odds(other), other.drift - best.drift) for other in some
+              if best and other is not best]
+    odds, more = min(rivals, default=(np.inf, 0.0))
+    sure = _RIVAL_PLACES * best.told.given.log_odds_of_place if best else 0.0
+    return best, more if odds < sure else 0.0
+
+
+def log_odds(one: Growth, other: Growth) -> float:
+    """
+    Return the ln of the odds of one map against another, of odometry with and without a drift.
+
+    Of each place that only one of them accepts, half a gate. The variances q of odometry and of
+    loops were found, so what loops measure has a density proportional to det C(q)^-1/2, and the
+    derivative of ln det C by ln q are the degrees of freedom f that the map leaves of the kind:
+    1/2 sum f ln(q of the other / q).
+    """
+    freedom = sum(np.bincount(state.given.is_loop[state.accepted], np.trace(
+        state.posterior.moment, axis1=1, axis2=2), 2) for state in (one, other)) / 2
+    calmer = np.log(other.noise.variance / one.noise.variance)
+    more = won(one, one) - won(one, other)
+    return float(freedom @ calmer / 2 + more * one.given.log_odds_of_place)
 
 
 def explains(told: Growth, as_stated: Growth) -> bool:
     """
     Return whether loops need the odometry to be rid of a drift.
 
-    That is, they do not fit without, or only if it is far noisier; or several places are won and
-    it is no noisier, as it would be if lies came in by chance. And the loops are of several
-    places: a lap that closes at one place closes as well if it has a turn more.
+    That is, hardly any fit without, or its odds are those of several places and the odometry is
+    no noisier, as it would be if lies came in by chance. And the loops are of several places: a
+    lap that closes at one place closes as well if it has a turn more.
     """
     loops, before = (np.flatnonzero(state.accepted & state.given.is_loop)
                      for state in (told, as_stated))
     if told.given.may_err_as_one(loops, _DRIFT_PLACES):
         return False
-    calmer = as_stated.noise.variance[0] / told.noise.variance[0]
-    more = won(as_stated, told) - won(as_stated, as_stated)
-    return (len(before) <= _FEW * len(loops) or (calmer >= 1 and more >= _DRIFT_PLACES)
-            or (calmer >= CALMER and 2 * len(loops) > len(before)))
+    calmer = told.noise.variance[0] <= as_stated.noise.variance[0]
+    enough = _DRIFT_PLACES * told.given.log_odds_of_place
+    return (len(before) <= _FEW * len(loops)
+            or bool(calmer and log_odds(told, as_stated) >= enough))
 
 
 def won(places_of: Growth, growth: Growth) -> int:
