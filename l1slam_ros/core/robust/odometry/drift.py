@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A heading that drifts: how far each metre of the odometry turns, by a vote of the loops.
+A heading that drifts: how far each metre of the odometry turns, as most loops have it.
 
 In: a graph in the plane, of whose loops nothing is believed yet. Out: the drift d [rad/m] that
 they agree on, and how sure that is. A true loop from keyframe i to j, with s metres of way
@@ -58,7 +58,7 @@ _NOISE = np.logspace(-3, 3, 13)
 # Rounds of expectation and maximisation of the share of true loops.
 _ROUNDS = 12
 # So many loops are asked at most.
-_ASKED = 2000
+_ASKED = 500
 # The density of a lie's turn.
 _EVEN = 1 / (2 * np.pi)
 # What is next to nothing.
