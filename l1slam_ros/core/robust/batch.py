@@ -77,15 +77,8 @@ from l1slam_ros.core.robust.judgement import (
     judgement_of,
     listed,
 )
-from l1slam_ros.core.robust.odometry.drift import (
-    NOISY,
-    Straight,
-    explains,
-    likeliest,
-    likely_drifts,
-    straightened,
-    won,
-)
+from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, explains, likeliest, straightened
+from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.evidence import REFUSED
@@ -170,7 +163,7 @@ class _Repair:
                 return best.found
         taken = drift_taken_for_noise(as_stated)
         for straight in self._without(taken) if taken else ():
-            if won(as_stated, straight.told) >= won(as_stated, as_stated):
+            if straight.keeps_places(as_stated):
                 self.drift = taken
                 return straight.found
         return None

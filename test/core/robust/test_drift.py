@@ -16,7 +16,8 @@ from problems import chain_of, graph_of
 from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
 from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.judgement import DRIFTS
-from l1slam_ros.core.robust.odometry.drift import likely_drifts, straightened
+from l1slam_ros.core.robust.odometry.drift import straightened
+from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.worlds.false_loops import random_false_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
 
@@ -30,19 +31,18 @@ def test_loops_agree_on_the_drift_that_there_is(drift):
     assert found == pytest.approx(drift, abs=2e-3)
 
 
-def test_of_laps_that_are_circles_the_least_drift_is_taken_and_a_turn_more_on_each_is_its_rival():
+def test_laps_that_are_circles_fit_by_a_turn_more_on_each_so_that_the_map_is_doubtful(rng):
     n = 300
     metres = 2 * np.pi * 48
     angle = 2 * np.pi * np.arange(2 * n) / n
     truth = np.column_stack((48 * np.cos(angle), 48 * np.sin(angle), angle))
     chain, back = chain_of(2 * n), np.arange(0, n, 10)
     pairs = np.concatenate((chain, np.column_stack((back, back + n))))
-    graph = graph_of(truth, pairs, np.zeros((len(pairs), 3)), np.diag([400.0, 400.0, 4e4]))
-    judgement = batch_map.solve(
-        straightened(graph, -DRIFT), None, batch_map.SolveOptions()).judgement
+    noise = rng.normal(0, (0.05, 0.05, 0.005), (len(pairs), 3))
+    graph = straightened(graph_of(truth, pairs, noise, np.diag([400.0, 400.0, 4e4])), -DRIFT)
+    judgement = batch_map.solve(graph, None, batch_map.SolveOptions()).judgement
     turns = (judgement.drift - DRIFT) * metres / (2 * np.pi)
-    assert abs(judgement.drift) <= DRIFT + 1e-4
-    assert turns == pytest.approx(round(turns), abs=0.02)
+    assert turns == pytest.approx(round(turns), abs=0.1)
     assert DRIFTS in {doubt.kind for doubt in judgement.doubts}
 
 
