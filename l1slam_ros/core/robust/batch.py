@@ -42,8 +42,8 @@ A slip
 A drift
     is an error of all steps, the same on each metre. Where loops are left out, or the odometry is
     far noisier than it says, it is a third explanation, asked before slips: odometry rid of it has
-    to win places, or be far less noisy (`drift`). Where all came in because the drift was learnt
-    as noise, it is seen in what they leave of the odometry.
+    to win places or be less noisy (`drift`). Where all came in because the drift was learnt as
+    noise, it is seen in what they leave of the odometry.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
@@ -77,7 +77,7 @@ from l1slam_ros.core.robust.judgement import (
     judgement_of,
     listed,
 )
-from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, explains, likeliest, straightened
+from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, likeliest, straightened
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
@@ -156,8 +156,8 @@ class _Repair:
         """Return the state without a drift that explains the loops, or was taken for noise."""
         if len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISY:
             best, rival = likeliest([straight for drift in likely_drifts(self._graph).tolist()
-                                      for straight in self._without(drift)])
-            if best and explains(best.told, as_stated):
+                                     for straight in self._without(drift)], as_stated)
+            if best:
                 self.drift = best.drift
                 self.rival = rival
                 return best.found

@@ -74,27 +74,31 @@ class Straight:
     def log_odds(self, other: 'Straight') -> float:
         """Return the ln of its odds against another drift, by what they lead to."""
         usual = log_prior(self.drift, USUAL**2) - log_prior(other.drift, USUAL**2)
-        return float(usual) + log_odds(self.told, other.told)
+        return float(usual) + _log_odds(self.told, other.told)
 
     def keeps_places(self, as_stated: Growth) -> bool:
         """Return whether loops of as many places are accepted as without."""
         return _places(as_stated, self.told) >= _places(as_stated, as_stated)
 
 
-def likeliest(some: list[Straight]) -> tuple[Straight | None, float]:
-    """Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0."""
+def likeliest(some: list[Straight], as_stated: Growth) -> tuple[Straight | None, float]:
+    """
+    Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0.
+
+    None where it does not explain the loops.
+    """
     best = None
     for straight in some:
         if not best or straight.log_odds(best) > 0:
             best = straight
-    rivals = [(best.log_odds(other), other.drift - best.drift) for other in some
-              if best and other is not best]
-    odds, more = min(rivals, default=(np.inf, 0.0))
-    sure = _RIVAL_PLACES * best.told.given.log_odds_of_place if best else 0.0
-    return best, more if odds < sure else 0.0
+    if not best or not _explains(best.told, as_stated):
+        return None, 0.0
+    odds, more = min(((best.log_odds(other), other.drift - best.drift)
+                      for other in some if other is not best), default=(np.inf, 0.0))
+    return best, more if odds < _RIVAL_PLACES * as_stated.given.log_odds_of_place else 0.0
 
 
-def log_odds(one: Growth, other: Growth) -> float:
+def _log_odds(one: Growth, other: Growth) -> float:
     """
     Return the ln of the odds of one map against another, of odometry with and without a drift.
 
@@ -110,7 +114,7 @@ def log_odds(one: Growth, other: Growth) -> float:
     return float(freedom @ calmer / 2 + more * one.given.log_odds_of_place)
 
 
-def explains(told: Growth, as_stated: Growth) -> bool:
+def _explains(told: Growth, as_stated: Growth) -> bool:
     """
     Return whether loops need the odometry to be rid of a drift.
 
@@ -125,7 +129,7 @@ def explains(told: Growth, as_stated: Growth) -> bool:
     calmer = told.noise.variance[0] <= as_stated.noise.variance[0]
     enough = _DRIFT_PLACES * told.given.log_odds_of_place
     return (len(before) <= _FEW * len(loops)
-            or bool(calmer and log_odds(told, as_stated) >= enough))
+            or bool(calmer and _log_odds(told, as_stated) >= enough))
 
 
 def _places(known: Growth, growth: Growth) -> int:
