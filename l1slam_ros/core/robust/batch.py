@@ -42,8 +42,8 @@ A slip
 A drift
     is an error of all steps, the same on each metre. Where loops are left out, or the odometry is
     far noisier than it says, it is a third explanation, asked before slips: odometry rid of it has
-    to win places, or be far less noisy (`drift`). Where all came in because the drift was learnt
-    as noise, it is seen in what they leave of the odometry.
+    to win places or be less noisy (`drift`). Where all came in because the drift was learnt as
+    noise, it is seen in what they leave of the odometry.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
@@ -77,7 +77,8 @@ from l1slam_ros.core.robust.judgement import (
     judgement_of,
     listed,
 )
-from l1slam_ros.core.robust.odometry.drift import CALMER, explains, find_drift, straightened, won
+from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, likeliest, straightened
+from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.evidence import REFUSED
@@ -153,29 +154,26 @@ class _Repair:
 
     def _straightened(self, as_stated: Growth) -> Growth | None:
         """Return the state without a drift that explains the loops, or was taken for noise."""
-        if len(as_stated.undecided()) or as_stated.noise.variance[0] > CALMER:
-            drift, odds, rival = find_drift(self._graph)
-            for straight, told in self._without(drift) if odds > 0 else ():
-                if explains(told, as_stated):
-                    self.drift, self.rival = drift, rival
-                    return straight
+        if len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISY:
+            best, rival = likeliest([straight for drift in likely_drifts(self._graph).tolist()
+                                     for straight in self._without(drift)], as_stated)
+            if best:
+                self.drift = best.drift
+                self.rival = rival
+                return best.found
         taken = drift_taken_for_noise(as_stated)
-        for straight, told in self._without(taken) if taken else ():
-            if won(as_stated, told) >= won(as_stated, as_stated):
+        for straight in self._without(taken) if taken else ():
+            if straight.keeps_places(as_stated):
                 self.drift = taken
-                return straight
+                return straight.found
         return None
 
-    def _without(self, drift: float) -> list[tuple[Growth, Growth]]:
-        """
-        Return the states, as found and as stated, that odometry without its drift leads to.
-
-        None, (), where that comes to no end.
-        """
+    def _without(self, drift: float) -> list[Straight]:
+        """Return what odometry without a drift leads to, none, [], where that has no end."""
         growth = Growth(straightened(self._graph, drift), self._check)
-        ends: list[tuple[Growth, Growth]] = []
+        ends: list[Straight] = []
         growth.begin()
-        for _ in rounds(growth, lambda *states: ends.append(states)):
+        for _ in rounds(growth, lambda *states: ends.append(Straight(drift, *states))):
             self._check()
         return ends
 

@@ -28,6 +28,8 @@ Gate = Callable[[Indices], Array]
 
 # Of factors that are believed at one time, any is false with at most this probability.
 DOUBT = 0.01
+# Of places of which many are believed at one time, this part is false at most.
+_FALSE_PLACES = 1e-3
 # The noise is judged by so many of the best predicted factors.
 _BEST_PREDICTED = 1000
 _ROUNDS = 100
@@ -89,17 +91,39 @@ def believable(
     odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), believed)
     log_odds = np.logaddexp(
         odds + beside, rivals(found, posterior, (fits, log_ratio, odds), place))
-    good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits])]
+    # Before any is believed, or by noise that is too large, lies fit nearly as well as true ones.
+    well = (found.square < gate(found.freedom) / 2) & (believed > 0)
+    good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits], place[fits],
+                                                 well[fits])]
     if not len(good):
         good = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
     return good
 
 
-def at_once(log_odds: Array) -> Indices:
-    """Return which may be believed, all of them at once, by ln (true / false), surest first."""
+def at_once(log_odds: Array, place: Indices, well: Mask) -> Indices:
+    """
+    Return which may be believed, all of them at once, surest first.
+
+    As many as are all true but for `DOUBT`. Of those that fit well, as many as no more than
+    `_FALSE_PLACES` of their places are expected to be false of, and `DOUBT` of one more place, so
+    that of few none is given away (the false discovery rate of Y. Benjamini and Y. Hochberg,
+    1995). A place may have been mistaken as a whole: it counts once, by its most doubtful factor.
+
+    log_odds : (m,) ln (true / false); place : (m,) see `places`; well : (m,) which fit well
+    """
     doubt = probability(-log_odds)
     order = np.argsort(doubt, kind='stable')
-    good: Indices = order[np.cumsum(doubt[order]) < DOUBT]
+    doubt = doubt[order]
+    by_place = np.argsort(place[order], kind='stable')
+    same = np.diff(place[order][by_place]) == 0
+    again = by_place[1:][same]
+    more = doubt.copy()
+    more[again] -= doubt[by_place[:-1][same]]
+    first = np.ones(len(doubt), bool)
+    first[again] = False
+    few = np.flatnonzero(DOUBT + np.cumsum(more) < _FALSE_PLACES * np.cumsum(first))
+    among_few = np.arange(len(doubt)) <= few.max(initial=-1)
+    good: Indices = order[(np.cumsum(doubt) < DOUBT) | (among_few & well[order])]
     return good
 
 

@@ -7,68 +7,35 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A heading that drifts: how far each metre of the odometry turns, by a vote of the loops.
+A heading that drifts: each metre of the odometry turns by some angle too little.
 
-In: a graph in the plane, of whose loops nothing is believed yet. Out: the drift d [rad/m] that
-they agree on, and how sure that is. A true loop from keyframe i to j, with s metres of way
-between them, says by how much the odometry has turned too little:
+In: a graph in the plane, and the states that its odometry leads to with and without a drift. Out:
+the odometry without it, and which drift is to be believed. Wheels of unequal size, or a gyroscope
+with an offset, do that.
 
-    phi = wrap(z_theta - (theta_j - theta_i)) = d s + noise,
-
-the noise normal, of the loop and of q times what the odometry states of its turns; a lie says any
-angle. The share of true loops is found with it (expectation and maximisation). Loops of one place
-count once for each stretch of it. Wheels of unequal size, or a gyroscope with an offset, do that.
-
-Angles are the same after a full turn, and a robot that goes round in laps turns as much all the
-time: lies that say two poses look the same way agree on a drift by which it never turned. So
-angles only propose drifts. Which one it is, positions decide, with the covariance that the noise
-of all steps between makes of angle and position. Laps may close with a turn more on each even so:
-of drifts that are nearly as likely the least one is taken, and the map is doubtful.
-
-Source: ours, by the recorded logs that `test_drift.py` names where they are.
+`drift_likelihood` proposes drifts. Of laps that close also those by which each has a full turn
+more, so a map is made by each: the one that wins most places with the least noise is taken. Where
+another one is nearly as likely, the map is doubtful.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.noise import covariance_of
-from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph, ends_in_time
-from l1slam_ros.core.graph.parts import bridged
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.robust.places import places
+from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
+from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL, log_prior
 from l1slam_ros.core.robust.rounds.growth import Growth
 
-# [rad/m] What wheels and gyros drift by: its standard deviation, and the most that is looked for.
-_USUAL, _MOST = 0.03, 0.18
-# [rad/m] Drifts are looked for so far apart; near so many of the likeliest, so many times as near,
-# until the longest loop tells them apart by no more than so much [rad].
-_STEP = 0.0008
-_PEAKS = 40
-_FINER, _FINE = 5, 0.02
-# Nearly as likely as the likeliest is a drift, or none, with this part of its odds to all loops
-# being lies: those of a lap share much of their errors, so that odds are less than they seem.
-_NEARLY = 0.75
-# What the odometry states of its turns may be off by, in variance.
-_NOISE = np.logspace(-3, 3, 13)
-# Rounds of expectation and maximisation of the share of true loops.
-_ROUNDS = 12
-# So many loops are asked at most.
-_ASKED = 2000
-# The density of a lie's turn.
-_EVEN = 1 / (2 * np.pi)
-# What is next to nothing.
-_TINY = 1e-9
-
-# A drift is believed of loops of so many places at least, if it wins as many, if no more than this
-# part of them fits without it, or if the variance of the odometry is so many times as large then.
+# A drift that is likelier by no more than so many places are worth has a rival.
+_RIVAL_PLACES = 2
+# A drift is believed of loops of so many places at least, if it is likelier by what these are
+# worth, or if no more than this part of them fits without it.
 _DRIFT_PLACES = 4
 _FEW = 0.1
-CALMER = 4.0
+# Odometry whose variance is so many times what it states may drift.
+NOISY = 4.0
 
 
 def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
@@ -91,222 +58,80 @@ def corrected(factors: BetweenFactors, rows: Indices, drift: float) -> Array:
     return se2.retract(measured, step)
 
 
-def find_drift(graph: FactorGraph) -> tuple[float, float, float]:
+@dataclass(frozen=True)
+class Straight:
     """
-    Return the drift of the heading [rad/m] that loops agree on, and the ln of its odds.
+    What odometry without a drift leads to.
 
-    The odds are positive where it is likelier than none. Laps that close also close if each has a
-    full turn more: of drifts that are nearly as likely, it is the least. Third comes how far off
-    the likeliest other one is; 0 without.
+    drift : it [rad/m]; found, told : the states with the noise as it was found, and where all may
+    be as noisy as they say.
     """
-    rows = np.flatnonzero(~graph.between.is_odometry & ~graph.between.is_absolute)
-    if graph.manifold is not se2 or not len(rows):
-        return 0.0, -np.inf, 0.0
-    rows = rows[:: max(1, len(rows) // _ASKED)]
-    likelihood = _drift_likelihood(bridged(graph), rows)
-    none = likelihood.value(0.0, 0.0)
-    peaks = sorted(((likelihood.value(drift, _USUAL**2), drift) for drift in likelihood.peaks()),
-                   reverse=True)
-    nearly = _NEARLY * peaks[0][0]
-    near = [peak for peak in peaks if peak[0] >= nearly]
-    if none >= nearly or not near:
-        return 0.0, -np.inf, 0.0
-    value, drift = min(near, key=lambda peak: abs(peak[1]))
-    return drift, value - none, next((other - drift for _, other in near if other != drift), 0.0)
+
+    drift: float
+    found: Growth
+    told: Growth
+
+    def log_odds(self, other: 'Straight') -> float:
+        """Return the ln of its odds against another drift, by what they lead to."""
+        usual = log_prior(self.drift, USUAL**2) - log_prior(other.drift, USUAL**2)
+        return float(usual) + _log_odds(self.told, other.told)
+
+    def keeps_places(self, as_stated: Growth) -> bool:
+        """Return whether loops of as many places are accepted as without."""
+        return _places(as_stated, self.told) >= _places(as_stated, as_stated)
 
 
-def explains(told: Growth, as_stated: Growth) -> bool:
+def likeliest(some: list[Straight], as_stated: Growth) -> tuple[Straight | None, float]:
+    """
+    Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0.
+
+    None where it does not explain the loops.
+    """
+    best = None
+    for straight in some:
+        if not best or straight.log_odds(best) > 0:
+            best = straight
+    if not best or not _explains(best.told, as_stated):
+        return None, 0.0
+    odds, more = min(((best.log_odds(other), other.drift - best.drift)
+                      for other in some if other is not best), default=(np.inf, 0.0))
+    return best, more if odds < _RIVAL_PLACES * as_stated.given.log_odds_of_place else 0.0
+
+
+def _log_odds(one: Growth, other: Growth) -> float:
+    """
+    Return the ln of the odds of one map against another, of odometry with and without a drift.
+
+    Of each place that only one of them accepts, half a gate. The variances q of odometry and of
+    loops were found, so what loops measure has a density proportional to det C(q)^-1/2, and the
+    derivative of ln det C by ln q are the degrees of freedom f that the map leaves of the kind:
+    1/2 sum f ln(q of the other / q).
+    """
+    freedom = sum(np.bincount(state.given.is_loop[state.accepted], np.trace(
+        state.posterior.moment, axis1=1, axis2=2), 2) for state in (one, other)) / 2
+    calmer = np.log(other.noise.variance / one.noise.variance)
+    more = _places(one, one) - _places(one, other)
+    return float(freedom @ calmer / 2 + more * one.given.log_odds_of_place)
+
+
+def _explains(told: Growth, as_stated: Growth) -> bool:
     """
     Return whether loops need the odometry to be rid of a drift.
 
-    That is, they do not fit without, or only if it is far noisier; or several places are won and
-    it is no noisier, as it would be if lies came in by chance. And the loops are of several
-    places: a lap that closes at one place closes as well if it has a turn more.
+    That is, hardly any fit without, or its odds are those of several places and the odometry is
+    no noisier, as it would be if lies came in by chance. And the loops are of several places: a
+    lap that closes at one place closes as well if it has a turn more.
     """
     loops, before = (np.flatnonzero(state.accepted & state.given.is_loop)
                      for state in (told, as_stated))
     if told.given.may_err_as_one(loops, _DRIFT_PLACES):
         return False
-    calmer = as_stated.noise.variance[0] / told.noise.variance[0]
-    more = won(as_stated, told) - won(as_stated, as_stated)
-    return (len(before) <= _FEW * len(loops) or (calmer >= 1 and more >= _DRIFT_PLACES)
-            or (calmer >= CALMER and 2 * len(loops) > len(before)))
+    calmer = told.noise.variance[0] <= as_stated.noise.variance[0]
+    enough = _DRIFT_PLACES * told.given.log_odds_of_place
+    return (len(before) <= _FEW * len(loops)
+            or bool(calmer and _log_odds(told, as_stated) >= enough))
 
 
-def won(places_of: Growth, growth: Growth) -> int:
-    """Return of how many places the loops are that a state accepts."""
-    return len(np.unique(places_of.given.place[growth.accepted & growth.given.is_loop]))
-
-
-def _drift_likelihood(graph: FactorGraph, rows: Indices) -> '_DriftLikelihood':
-    """Return what some loops, (k,), of a graph without gaps say of its odometry."""
-    chain = odometry_poses(graph)
-    low, high, measured = ends_in_time(graph)
-    factors = graph.between
-    steps = np.flatnonzero(factors.is_odometry)
-    covariance = covariance_of(factors.sqrt_information)
-    way, noise = np.zeros(graph.n_poses), np.zeros((graph.n_poses, 2))
-    at = np.minimum(factors.i, factors.j)[steps] + 1
-    way[at] = np.hypot(*factors.measurement[steps, :2].T)
-    noise[at] = np.stack((np.trace(covariance[steps, :2, :2], axis1=1, axis2=2) / 2,
-                          covariance[steps, 2, 2]), axis=1)
-    way = np.cumsum(way)
-    place, ends = places(graph, chain)
-    return _DriftLikelihood(
-        chain, way, noise, low[rows], high[rows], measured[rows], covariance[rows],
-        _weights(place[rows], ends[rows]), noise[:, 1].sum() / max(way[-1], _TINY) ** 2)
-
-
-def _weights(place: Indices, ends: Array) -> Array:
-    """
-    Return the weight of each loop, (k,): a place counts once for each stretch that is near.
-
-    place, ends : see `places`
-    """
-    order = np.argsort(place, kind='stable')
-    _, first, number, count = np.unique(place[order], return_index=True, return_inverse=True,
-                                        return_counts=True)
-    long = np.maximum.reduceat(ends[order], first) - np.minimum.reduceat(ends[order], first)
-    weight = np.empty(len(place))
-    weight[order] = np.minimum(1 / count + long.max(axis=1) / (2 * count), 1.0)[number]
-    return weight
-
-
-@dataclass(frozen=True)
-class _DriftLikelihood:
-    """
-    How likely drifts of the odometry are, by k loops.
-
-    chain : (n, 3) poses along the odometry; way : (n,) metres to each; noise : (n, 2) variance of
-    the position and of the heading of the step to each, as stated; low, high : (k,) the ends of
-    each loop; measured : (k, 3) by it; own : (k, 3, 3) its covariance; weight : (k,) of each;
-    walk : the variance of a drift that is but noise.
-    """
-
-    chain: Array
-    way: Array
-    noise: Array
-    low: Indices
-    high: Indices
-    measured: Array
-    own: Array
-    weight: Array
-    walk: float
-
-    def peaks(self) -> Array:
-        """Return the drifts, (p,), near which most of the headings agree, likeliest first."""
-        drift = np.arange(-_MOST, _MOST + _STEP / 2, _STEP)
-        values = [self._by_headings(drift, _STEP, q) for q in _NOISE]
-        value, noise = np.max(values, axis=0), _NOISE[np.argmax(values, axis=0)]
-        is_peak = (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:])
-        at = 1 + np.flatnonzero(is_peak)
-        at = at[np.argsort(-value[at], kind='stable')[:_PEAKS]]
-        return np.array([self._refined(drift[peak], noise[peak]) for peak in at])
-
-    def _refined(self, drift: float, q: float) -> float:
-        """Return where the peak near a drift is, as finely as the longest loop tells."""
-        step = _STEP
-        metres = float(self._headings[0].max())
-        while step * metres > _FINE:
-            near = drift + step * np.linspace(-1, 1, 2 * _FINER + 1)
-            step /= _FINER
-            drift = float(near[np.argmax(self._by_headings(near, step, q))])
-        return drift
-
-    @cached_property
-    def _headings(self) -> tuple[Array, Array, Array]:
-        """Return the ways [m], the variances of turns, and what these lack, of loops, (k,)."""
-        low, high = self.low, self.high
-        turns = np.cumsum(self.noise[:, 1])
-        lack = self.measured[:, 2] - (self.chain[high, 2] - self.chain[low, 2])
-        return self.way[high] - self.way[low], turns[high] - turns[low], lack
-
-    def _by_headings(self, drift: Array, step: float, q: float) -> Array:
-        """Return the ln of the likelihood of drifts, (d,), known to a step, by headings alone."""
-        metres, turns, lack = self._headings
-        variance = self.own[:, 2, 2] + q * turns + (metres * step) ** 2 / 12
-        error = se2.wrap(lack - drift[:, None] * metres)
-        density = np.exp(-error**2 / (2 * variance)) / np.sqrt(2 * np.pi * variance)
-        # All around the circle, what is wider than it is even.
-        density = np.maximum(density, np.where(variance > np.pi**2 / 3, _EVEN, 0.0))
-        return _log_likelihood(density / _EVEN, self.weight) + _log_prior(
-            drift, _USUAL**2 + q * self.walk)
-
-    def value(self, drift: float, usual: float) -> float:
-        """
-        Return the ln of the likelihood of a drift, by what loops measure, and of its prior.
-
-        usual : its variance, but for what noise makes
-        """
-        low, high = self.low, self.high
-        heading = self.chain[:, 2] + drift * self.way
-        # As complex numbers: each step is turned by the drift up to it.
-        step = np.diff(self.chain[:, 0] + 1j * self.chain[:, 1]) * np.exp(
-            1j * drift * self.way[:-1])
-        at = np.append(0, np.cumsum(step))
-        off = at[low] + np.exp(1j * heading[low]) * (
-            self.measured[:, 0] + 1j * self.measured[:, 1]) - at[high]
-        turn = se2.wrap(self.measured[:, 2] - (heading[high] - heading[low]))
-        error = np.stack((off.real, off.imag, turn), axis=1)
-        spread = self._spread(np.stack((at.real, at.imag), axis=1))
-        cosine, sine = np.cos(heading[high]), np.sin(heading[high])
-        turned = np.zeros((len(low), 3, 3))
-        turned[:, 0, 0] = turned[:, 1, 1] = cosine
-        turned[:, 1, 0] = sine
-        turned[:, 0, 1] = -sine
-        turned[:, 2, 2] = 1.0
-        own = turned @ self.own @ turned.transpose(0, 2, 1)
-        # Lies claim anything, as far as the way leads.
-        log_room = np.log(2 * np.pi**2 * np.var(at))
-        values = []
-        for q in _NOISE:
-            square, log_det = kernels.prediction.normalise(q * spread + own, error)
-            log_ratio = log_room - (square + log_det + 3 * np.log(2 * np.pi)) / 2
-            values.append(_log_likelihood(np.exp(log_ratio)[None], self.weight)[0]
-                          + _log_prior(drift, usual + q * self.walk))
-        return float(max(values))
-
-    def _spread(self, at: Array) -> Array:
-        """Return the covariances (k, 3, 3) that the steps make, positions being (n, 2)."""
-        position, turn = self.noise.T
-        # Each turn moves the end of a loop by its distance to it, sideways.
-        side = np.column_stack((-at[:, 1], at[:, 0]))
-        first = turn[:, None] * side
-        sums = np.cumsum(np.column_stack((position, turn, first, first[:, :1] * side,
-                                          first[:, 1] * side[:, 1])), axis=0)
-        sums = sums[self.high] - sums[self.low]
-        end = side[self.high]
-        # The sums of the turns' variances, and of these times what each is to the side.
-        zero, one = sums[:, 1], sums[:, 2:4]
-        spread = np.empty((len(end), 3, 3))
-        spread[:, :2, 2] = spread[:, 2, :2] = zero[:, None] * end - one
-        spread[:, 2, 2] = zero
-        both = np.einsum('ka,kb->kab', end, one)
-        spread[:, :2, :2] = (
-            zero[:, None, None] * np.einsum('ka,kb->kab', end, end) - both
-            - both.transpose(0, 2, 1) + sums[:, [[4, 5], [5, 6]]]
-            + sums[:, 0, None, None] * np.eye(2))
-        return spread
-
-
-def _log_prior(drift: Array | float, variance: float) -> Array | float:
-    """Return the ln of the density of drifts, normal about none."""
-    return -(drift**2 / variance + np.log(2 * np.pi * variance)) / 2
-
-
-def _log_likelihood(ratio: Array, weight: Array) -> Array:
-    """
-    Return the ln of the likelihood of each drift, (d,), the share of true loops at its best.
-
-    ratio : (d, k) how much likelier each loop is true than false
-    """
-    share = np.full((len(ratio), 1), 0.5)
-    part = weight / weight.sum()
-    true = np.empty_like(ratio)
-    for _ in range(_ROUNDS):
-        # ratio / (ratio + (1 - share) / share)
-        np.add(ratio, 1 / share - 1, out=true)
-        np.divide(ratio, true, out=true)
-        share = (true @ part)[:, None].clip(1e-3, 1 - 1e-3)
-    value: Array = np.log(share * ratio + (1 - share)) @ weight
-    return value
+def _places(known: Growth, growth: Growth) -> int:
+    """Return of how many places, as one state knows them, the loops are that another accepts."""
+    return len(np.unique(known.given.place[growth.accepted & growth.given.is_loop]))

@@ -180,7 +180,7 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
     """
     odds, left_out = log_odds_of_slips(growth, motion), as_stated.undecided()
     # Where loops are left out, one more place may be won.
-    least = max(SURE, _place(growth)) if len(left_out) else SURE
+    least = max(SURE, growth.given.log_odds_of_place) if len(left_out) else SURE
     for step in _suspected(growth, odds, left_out, least if first else np.inf):
         state, usual = _without(growth, step), False
         if state:
@@ -256,12 +256,7 @@ def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:
     before, explained, after = (np.unique(place[state.accepted & is_loop])
                                 for state in (growth, as_stated, cut))
     won = len(np.setdiff1d(after, np.union1d(before, explained)))
-    return _place(growth) * (won - len(np.setdiff1d(before, after)))
-
-
-def _place(growth: Growth) -> float:
-    """Return what a place is worth, ln of odds: half a gate."""
-    return float(growth.given.gate(np.array([growth.given.graph.manifold.TANGENT_SIZE]))[0] / 2)
+    return growth.given.log_odds_of_place * (won - len(np.setdiff1d(before, after)))
 
 
 def _likeliest(state: Growth, cut: int, motion: Motion) -> int:

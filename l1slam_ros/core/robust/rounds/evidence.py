@@ -81,6 +81,11 @@ class Evidence:
         """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
         return student_quantile(1 - refused, freedom, self.graph.manifold.TANGENT_SIZE)
 
+    @property
+    def log_odds_of_place(self) -> float:
+        """What the loops of a place are worth, ln of odds: half a gate."""
+        return float(self.gate(np.array([self.graph.manifold.TANGENT_SIZE]))[0] / 2)
+
     def may_err_as_one(self, loops: Indices, fewest: int = _FEWEST_PLACES) -> bool:
         """Return whether loops are of fewer places, none of which joins much of the way."""
         place = self.place[loops]
