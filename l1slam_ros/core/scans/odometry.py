@@ -97,13 +97,15 @@ class Step:
 
     pose : (3,) of the robot in the frame of this odometry; keyframe : None, or the new one;
     covariance : (3, 3) of the motion from the keyframe before to the pose, in the axes of the
-    pose; said : what is to be told of it, empty: nothing
+    pose; said : what is to be told of it, empty: nothing; by_wheels : of the length of that motion
+    the wheels say more than scans do
     """
 
     pose: Array
     keyframe: Keyframe | None
     covariance: Array
     said: str = ''
+    by_wheels: bool = False
 
 
 class ScanOdometry:
@@ -296,8 +298,15 @@ class ScanOdometry:
         if self._unmatched or done < 1.0:
             return Step(self._pose, None, covariance, said)
         keyframe = Keyframe(stamp, self._pose, points, last.part, last.travelled + way)
+        by_wheels = self._is_by_wheels(moved)
         self._keep(keyframe)
-        return Step(self._pose, keyframe, covariance, said)
+        return Step(self._pose, keyframe, covariance, said, by_wheels)
+
+    def _is_by_wheels(self, moved: Array) -> bool:
+        """Tell whether scans took less than half of the variance along a motion (3,)."""
+        along = rotated(np.array([0.0, 0.0, -moved[2]]), moved[None, :2])[0]
+        known = along @ self._covariance[:2, :2] @ along
+        return bool(2 * known > along @ self._untold[:2, :2] @ along)
 
     def _begin(self, stamp: int, points: Points, said: str = '') -> Step:
         part = 0

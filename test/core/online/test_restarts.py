@@ -252,3 +252,29 @@ def test_a_restart_is_the_users_to_ignore():
     told(backend, laps, laps.restarted(TIMES['far'], 0.05, NEAR))
     assert not backend.snapshot().graph.firsts.size
     assert 'the robot is taken to be where it was' in backend.news()[0]
+
+
+def unsure_at(stamps):
+    """Return how often a step is said to be hardly known, of a robot that drives .05 m each."""
+    builder = GraphBuilder(se2, GraphBuilderOptions())
+    for time, pose in zip(stamps, straight(len(stamps), 0.05), strict=True):
+        builder.add_odometry(odometry(time, pose))
+    return builder.notes.warned['unsure']
+
+
+@pytest.mark.parametrize('in_a_heap', [10, 25, 60])
+def test_stamps_that_come_in_heaps_are_doubted_once(in_a_heap):
+    """All samples of 4 s are stamped within 1.8 s; the odometry has not stood in between."""
+    heap = np.linspace(0.0, 1.8, in_a_heap)
+    before = 10.0 + 0.1 * np.arange(50)
+    heaps = [before[-1] + 0.1 + 4.0 * k + heap for k in range(20)]
+    assert unsure_at(np.concatenate((before, *heaps))) <= 1
+
+
+@pytest.mark.parametrize('seconds', [1.0, 2.5, 4.0])
+def test_odometry_that_stands_now_and_then_is_doubted_each_time(seconds):
+    """A driver stands still, and goes on from where it was; of three times each is said."""
+    times = 10.0 + 0.1 * np.arange(500)
+    for k in (100, 220, 340):
+        times[k:] += seconds
+    assert unsure_at(times) == 3

@@ -250,6 +250,8 @@ class OdometryStream:
             step = Step(self._manifold, last, point)
             point.seconds = step.seconds
             point.reach = self._recent.reach(step, bool(point.gap))
+            if not point.gap:
+                self._recent.hear(step)
             if point.unsure:  # it is not known where between the two either
                 point.reach = point.unseen, UNSEEN_TURN * step.seconds
             elif not point.gap:

@@ -23,6 +23,7 @@ odometry began again, the less a step may be off:
 Nobody can tell what the robot did in the step that is too long after a silence, or where samples
 are missing and it made next to no way, though it moved all the time before and after; nor in any
 after which the odometry may have begun again: that is as uncertain as the robot may have moved.
+A robot that seems to stand in a silence every few seconds is one whose stamps come in heaps.
 """
 
 import math
@@ -142,10 +143,24 @@ class RecentMotion:
         self._manifold = manifold
         self._steps: deque[Step] = deque(maxlen=_RECENT)
         self._fastest_turn = _TURN  # of all steps [rad/s]
+        # The last silence in which it made next to no way, and how long ago that was [s].
+        self._stood = 0.0
+        self._since = 0.0
 
     def forget(self) -> None:
         """Begin with no step."""
         self._steps.clear()
+        self._stood = 0.0
+
+    def hear(self, step: Step) -> None:
+        """Take in how long a step took, whatever the robot did meanwhile; before `add`."""
+        self._since += step.seconds
+        if self._since > _STOPS:
+            self._stood = 0.0
+        if step.seconds > max(SILENCE, self._stood / _ONE) and (
+                step.metres < _NOTHING * self.pace()[0] * step.seconds):
+            self._stood = step.seconds
+            self._since = 0.0
 
     def add(self, step: Step) -> None:
         """Take a step in that the robot has made."""
@@ -210,6 +225,7 @@ class RecentMotion:
 
         One of next to nothing, where samples are missing, while it moved on; or one after a
         silence, after which the odometry may have begun again, or is not where it was going.
+        What recurs within `_STOPS` is how the samples are stamped, and says little of the robot.
         after : see `jumps`; None: it goes on as before
         """
         if not self._steps or not self.is_missing(step.seconds):
@@ -231,6 +247,8 @@ class RecentMotion:
 
     def _stood_only_then(self, step: Step, after: Step | None) -> bool:
         """Tell whether the robot made next to no way in a step, but at all before, and after."""
+        if step.seconds < _ONE * self._stood:
+            return False  # it does so again and again: its stamps come in heaps
         seconds = [one.seconds for one in self._steps]
         usual = self._usual
         jitters = min(seconds) < usual / _ONE or max(seconds) > usual * _ONE

@@ -1,0 +1,46 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""What is said of a way whose length only the wheels know."""
+
+import numpy as np
+import pytest
+from rooms import along, box, drive
+
+from l1slam_ros.core.scans.points import Mount
+from l1slam_ros.io.scans.to_graph import map_scans
+
+CORRIDOR = box(0, 0, 60, 2)
+# A door frame every 3 m.
+FRAMES = np.concatenate([box(x, 1.8, x + 0.3, 2.0) for x in np.arange(2.0, 60.0, 3.0)])
+
+
+def said_of(walls, first, last):
+    """Return what is said of a drive along y = 1 with a laser that sees 8 m far."""
+    def near(ranges, *_):
+        return np.where(ranges < 8.0, ranges, np.inf)
+
+    true = along(np.array([(first, 1.0), (last, 1.0)]), 0.25)
+    made = map_scans(zip(*drive(true, 1, walls, near), strict=True), Mount())
+    return [sentence for sentence in made.record.skipped if 'wheels say' in sentence]
+
+
+def test_a_bare_corridor_is_as_long_as_the_wheels_say_and_that_is_said():
+    sentence, = said_of(CORRIDOR, 10.0, 30.0)
+    assert sentence.startswith('scans do not show how far the robot went over ')
+    # All of the 20 m but what comes before the first and after the last keyframe.
+    assert 18 <= float(sentence.split(' over ')[1].split()[0]) <= 20
+    assert '(1 stretch, ' in sentence
+
+
+@pytest.mark.parametrize('walls, first, last', [
+    (np.concatenate((CORRIDOR, FRAMES)), 10.0, 30.0), (CORRIDOR, 1.0, 7.5),
+    (CORRIDOR, 10.0, 13.0)],
+    ids=['door frames', 'its end is seen', 'a short way'])
+def test_where_scans_show_the_way_or_it_is_short_nothing_is_said(walls, first, last):
+    assert not said_of(walls, first, last)
