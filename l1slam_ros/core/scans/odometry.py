@@ -71,6 +71,10 @@ _ASIDE = 0.1
 # motion: where a driver loses the sign of wheels that turn backwards, it does for a while.
 _DISTRUST = 25
 _WRONG = 2.0
+# [m] Wheels that are 5% wrong make a right map a wrong one over so long a way.
+_LONG = 5.0
+_BY_WHEELS = (f'scans did not show over {_LONG:.0f} m how far the robot went, as in a bare '
+              'corridor: there the map is as long as the wheels say')
 # Errors of a match that no count of points lessens, of the map and of normals: ahead, to the
 # left [m, m, rad]. Found by simulation; see `matching.KAPPA`.
 FLOOR: Array = np.square(np.diag((0.003, 0.002, 0.0002)))
@@ -97,15 +101,13 @@ class Step:
 
     pose : (3,) of the robot in the frame of this odometry; keyframe : None, or the new one;
     covariance : (3, 3) of the motion from the keyframe before to the pose, in the axes of the
-    pose; said : what is to be told of it, empty: nothing; by_wheels : of the length of that motion
-    the wheels say more than scans do
+    pose; said : what is to be told of it, empty: nothing
     """
 
     pose: Array
     keyframe: Keyframe | None
     covariance: Array
     said: str = ''
-    by_wheels: bool = False
 
 
 class ScanOdometry:
@@ -136,6 +138,8 @@ class ScanOdometry:
         self._distrusted = 0
         # Where a scan was matched last, and the wheels' way and turns since.
         self._known, self._blind = np.zeros(3), np.zeros(2)
+        # How far it went since scans showed how far [m].
+        self._by_wheels = 0.0
 
     def add(self, stamp: int, points: Points, wheels: Array) -> Step:
         """Follow the robot to a scan; wheels : (3,) its pose by the wheels at that stamp."""
@@ -298,19 +302,27 @@ class ScanOdometry:
         if self._unmatched or done < 1.0:
             return Step(self._pose, None, covariance, said)
         keyframe = Keyframe(stamp, self._pose, points, last.part, last.travelled + way)
-        by_wheels = self._is_by_wheels(moved)
+        said = '; '.join(filter(None, (said, self._said_of_length(moved))))
         self._keep(keyframe)
-        return Step(self._pose, keyframe, covariance, said, by_wheels)
+        return Step(self._pose, keyframe, covariance, said)
 
-    def _is_by_wheels(self, moved: Array) -> bool:
-        """Tell whether scans took less than half of the variance along a motion (3,)."""
+    def _said_of_length(self, moved: Array) -> str:
+        """
+        Return what is to be said where scans do not show how far the robot went, once a stretch.
+
+        That is, they took less than half of the variance along each motion (3,) of it.
+        """
         along = rotated(np.array([0.0, 0.0, -moved[2]]), moved[None, :2])[0]
         known = along @ self._covariance[:2, :2] @ along
-        return bool(2 * known > along @ self._untold[:2, :2] @ along)
+        before = self._by_wheels
+        by_wheels = 2 * known > along @ self._untold[:2, :2] @ along
+        self._by_wheels = before + float(np.hypot(*moved[:2])) if by_wheels else 0.0
+        return _BY_WHEELS if before < _LONG <= self._by_wheels else ''
 
     def _begin(self, stamp: int, points: Points, said: str = '') -> Step:
         part = 0
         travelled = 0.0
+        self._by_wheels = 0.0
         self._known = self._pose
         if self.keyframes:
             part = self.keyframes[-1].part + 1

@@ -36,8 +36,6 @@ from l1slam_ros.io.scans.scan_path import ScanPath
 
 # The map is solved anew for each loop while there are few, later when they grew by this fraction.
 _MORE_LOOPS = 0.1
-# [m] Wheels that are 5% wrong make a right map a wrong one over so long a way.
-_LONG = 5.0
 
 
 @dataclass(frozen=True)
@@ -95,8 +93,6 @@ class _Making:
         self._graph = FactorGraph(se2)
         self._mapped = 0  # loops in the map that the front end knows
         self._said: list[str] = []
-        # Of each keyframe the way to it, 0 where scans say how long that is [m].
-        self._by_wheels: list[float] = []
         self._stamps: list[int] = []
         self._poses: list[Array] = []
         self._last: list[int] = []
@@ -127,11 +123,8 @@ class _Making:
         keyframes = self._front_end.keyframes
         if len(keyframes) < 2 or keyframes[-1].part != keyframes[-2].part:
             self._graph.add_poses(1, self._drive)
-            self._by_wheels.append(0.0)
             return
         motion = se2.between(keyframes[-2].pose[None], keyframes[-1].pose[None])
-        way = keyframes[-1].travelled - keyframes[-2].travelled
-        self._by_wheels.append(way if step.by_wheels else 0.0)
         self._graph.append_step(motion, root_of_inverse(step.covariance[None]), self._drive)
 
     def _add(self, loops: list[ScanLoop]) -> None:
@@ -147,24 +140,11 @@ class _Making:
         keyframes = self._front_end.keyframes
         stamps = np.array([keyframe.stamp for keyframe in keyframes], np.int64)
         said = tuple(f'{sentence} ({counted(self._said.count(sentence), "time")})'
-                     for sentence in dict.fromkeys(self._said)) + self._said_of_wheels()
+                     for sentence in dict.fromkeys(self._said))
         record = GraphRecord(self._graph, None, np.arange(self._graph.n_poses), stamps, said)
         path = ScanPath(np.array(self._stamps, np.int64), np.array(self._poses).reshape(-1, 3),
                         np.array(self._last, np.int64))
         return ScanMap(record, [keyframe.points for keyframe in keyframes], path)
-
-    def _said_of_wheels(self) -> tuple[str, ...]:
-        """Return what is to be said of long ways along which scans do not show the motion."""
-        ways = np.array(self._by_wheels)
-        stretch = np.cumsum(ways == 0.0)
-        lengths = np.bincount(stretch, ways) if len(ways) else ways
-        long = lengths[lengths >= _LONG]
-        if not len(long):
-            return ()
-        stretches = counted(len(long), 'stretch', 'stretches')
-        return (f'scans do not show how far the robot went over {long.sum():.0f} m of the way '
-                f'({stretches}, the longest {long.max():.0f} m), as in a bare corridor: there '
-                'the map is as long as the wheels say',)
 
 
 def _mapped(graph: FactorGraph) -> tuple[Array, Array]:
