@@ -152,7 +152,9 @@ class Listener:
     """Keeps what the back end publishes, and knows how much of a recording is in its map."""
 
     def __init__(self, node: Node, recording: Recording):
-        self.node, self.recording, self.heard = node, recording, Heard()
+        self.node = node
+        self.recording = recording
+        self.heard = Heard()
         self.moved = time.monotonic()
         self._said: dict[str, str] = {}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

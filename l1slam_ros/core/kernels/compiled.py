@@ -58,7 +58,9 @@ class Loop:
                  takes_in_space: tuple[str, ...] = ()) -> None:
         update_wrapper(self, py_func)
         objects.note_import(_source(py_func))
-        self.py_func, self.takes, self.takes_in_space = py_func, takes, takes_in_space
+        self.py_func = py_func
+        self.takes = takes
+        self.takes_in_space = takes_in_space
         self.linked: tuple[link.Linked, ...] = ()
         self._sought: dict[bool, bool] = {}
         self._dispatcher: Any = None

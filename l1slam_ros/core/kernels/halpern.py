@@ -109,7 +109,9 @@ def iterate(tiles, keyframes, x, z, g, weight, first, count, K):
     for iteration in range(first, first + count):
         # Numbers of the tiles' own precision: one double makes all of its loop double.
         a, rest = number((iteration + 1) / (iteration + 2)), number(1 / (iteration + 2))
-        w, twice, one = number(weight), number(2 / weight), number(1)
+        w = number(weight)
+        twice = number(2 / weight)
+        one = number(1)
         _reflect(x.ravel(), z.ravel(), g.ravel(), twice, a)
         for t in range(len(tiles)):
             tile = tiles[t]
@@ -148,8 +150,9 @@ def look(tiles, keyframes, x, g, weight, x_bar, g_bar, y_bar, K):
     dual = 2 * k * k + k
     local = np.empty(5 * k * LANES, tiles.dtype)
     d = np.empty_like(g)
-    w, one, rest = number(weight), number(1), number(1 / weight)
-    moved, turned, crossed, cost, value = 0.0, 0.0, 0.0, 0.0, 0.0
+    w, one = number(weight), number(1)
+    rest = number(1 / weight)
+    moved = turned = crossed = cost = value = 0.0
     for v in range(len(x)):
         for c in range(k):
             d[v, c] = rest * g[v, c]

@@ -54,12 +54,12 @@ def minimum_degree(start, adjacent, limit, stage, order_begun, column_begun, row
     """
     n, done = len(start) - 1, len(order_begun)
     # The lists of nodes by stage and degree.
-    head = _heads(stage)
+    head = _empty_lists(stage)
     after, before = np.empty(n, np.int32), np.empty(n, np.int32)
     seen, counted = _range(n, -1, 0), _range(n, -1, 0)
     outside = np.zeros(n, np.int32)
-    order, column, rows = _resumed(n, limit, order_begun, column_begun, rows_begun)
-    place, absorbed = _places(n, order_begun, column, rows)
+    order, column, rows, place, absorbed = _resumed(
+        n, limit, order_begun, column_begun, rows_begun)
     start, lists, n_variables, n_elements, degree = _quotient(
         start, adjacent, order_begun, column, rows, place, absorbed)
     for k in range(n):
@@ -71,7 +71,8 @@ def minimum_degree(start, adjacent, limit, stage, order_begun, column_begun, row
             lowest += 1
         pivot = head[lowest]
         _take(head, after, before, pivot, lowest)
-        order[step], place[pivot], seen[pivot] = pivot, step, pivot
+        order[step], place[pivot] = pivot, step
+        seen[pivot] = pivot
         end = _gather(pivot, start, lists, n_variables, n_elements, column, rows, place, seen,
                       absorbed, column[step])
         if end < 0:
@@ -101,8 +102,8 @@ def _range(n, first, step):
 
 
 @compiled
-def _heads(stage):
-    """Return the heads of the lists of nodes by stage and degree, all empty."""
+def _empty_lists(stage):
+    """Return the first node of each list, by stage and degree: -1, none."""
     highest = 0
     for k in range(len(stage)):
         highest = max(highest, stage[k])
@@ -111,27 +112,24 @@ def _heads(stage):
 
 @compiled
 def _resumed(n, limit, order_begun, column_begun, rows_begun):
-    """Return room for order, column and rows, with what has begun at the front."""
-    order, column, rows = np.empty(n, np.int32), np.empty(n + 1, np.int64), np.empty(
-        limit, np.int32)
+    """
+    Return room for order, column and rows, with what has begun at the front.
+
+    And the step of each node, -1 if it is to come, and whether its element is absorbed.
+    """
+    order, rows = np.empty(n, np.int32), np.empty(limit, np.int32)
+    column = np.empty(n + 1, np.int64)
+    place, absorbed = _range(n, -1, 0), np.zeros(n, np.bool_)
     column[0] = 0
     for step in range(len(order_begun)):
         order[step], column[step + 1] = order_begun[step], column_begun[step + 1]
+        place[order[step]] = step
     for at in range(column[len(order_begun)]):
         rows[at] = rows_begun[at]
-    return order, column, rows
-
-
-@compiled
-def _places(n, order, column, rows):
-    """Return the step of each node, -1 if it is to come, and whether its element is absorbed."""
-    place, absorbed = _range(n, -1, 0), np.zeros(n, np.bool_)
-    for step in range(len(order)):
-        place[order[step]] = step
-    for step in range(len(order)):
+    for step in range(len(order_begun)):
         for k in rows[column[step]:column[step + 1]]:
             absorbed[order[step]] |= place[k] >= 0
-    return place, absorbed
+    return order, column, rows, place, absorbed
 
 
 @compiled
@@ -261,20 +259,20 @@ def dissect(start, adjacent):
     start, adjacent : as of `minimum_degree`
     """
     n = len(start) - 1
-    cut, part, level = np.zeros(n, np.int32), np.zeros(n, np.int32), np.empty(n, np.int32)
-    nodes, queue = _range(n, 0, 1), np.empty(n, np.int32)
+    cut, part = np.zeros(n, np.int32), np.zeros(n, np.int32)
+    level, queue = np.empty(n, np.int32), np.empty(n, np.int32)
+    nodes = _range(n, 0, 1)
     begin, end = np.zeros(n + 2, np.int32), np.empty(n + 2, np.int32)
-    depth, count, number, deepest = np.zeros(n + 2, np.int32), 1, 0, 0
+    depth, deepest = np.zeros(n + 2, np.int32), 0
+    count, number = 1, 0
     end[0] = n
     while count:
         count -= 1
-        low, high, below = begin[count], end[count], depth[count] + 1
-        if high - low <= _WHOLE:
+        low, below = begin[count], depth[count] + 1
+        own = nodes[low:end[count]]
+        if len(own) <= _WHOLE:
             continue
         number += 1
-        own = nodes[low:high]
-        for k in own:
-            part[k] = number
         reached = _edge(own, number, start, adjacent, part, level, queue)
         middle = n
         if reached == len(own):
@@ -316,11 +314,13 @@ def _edge(own, number, start, adjacent, part, level, queue):
 
 @compiled
 def _levels(root, own, number, start, adjacent, part, level, queue):
-    """Write the level of each node, and those that are tied to the root to the queue, in order."""
+    """Write the part and level of own nodes, and those tied to the root to the queue, in order."""
     far = len(level) + 1
     for k in own:
+        part[k] = number
         level[k] = far
-    level[root], queue[0], at, end = 0, root, 0, 1
+    level[root], queue[0] = 0, root
+    at, end = 0, 1
     while at < end:
         k = queue[at]
         at += 1
@@ -334,7 +334,8 @@ def _levels(root, own, number, start, adjacent, part, level, queue):
 @compiled
 def _middle(queue, number, start, adjacent, part, level):
     """Return the level that separates with the fewest nodes, and evenly; -1: none does."""
-    best, least, at, size = -1, np.inf, 0, len(queue)
+    best, least = -1, np.inf
+    at, size = 0, len(queue)
     while at < size:
         own, touching = level[queue[at]], 0
         while at < size and level[queue[at]] == own:

@@ -148,7 +148,9 @@ def left_over(keyframe, blocks, x, y):
 @loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1])')
 def moved(keyframe, blocks, x):
     """Return A x of each factor and sample, (m, k, q)."""
-    k, steps, d = x.shape[1], x.ravel(), np.zeros((len(blocks), x.shape[1], SAMPLES))
+    k = x.shape[1]
+    steps = x.ravel()
+    d = np.zeros((len(blocks), x.shape[1], SAMPLES))
     product = d.ravel()
     for f in range(len(blocks)):
         _add_moved(keyframe[f], blocks[f], steps, 1.0, product, f * k)
@@ -200,7 +202,10 @@ def normalise(covariance, residual):
     Cholesky; where C is not definite beyond rounding, infinity and minus infinity.
     """
     m, k = residual.shape
-    square, log_det, u, whole = np.empty(m), np.empty(m), np.empty(k), np.empty(k)
+    square = np.empty(m)
+    log_det = np.empty(m)
+    u = np.empty(k)
+    whole = np.empty(k)
     for f in range(m):
         for r in range(k):
             whole[r] = covariance[f, r, r]
@@ -218,7 +223,9 @@ def normalise_pairs(covariance, residual, shared, first, second):
     """
     m, k = residual.shape
     square, log_det = np.empty(len(first)), np.empty(len(first))
-    own, logs, u = np.empty(m), np.empty(m), np.empty((m, k))
+    own = np.empty(m)
+    logs = np.empty(m)
+    u = np.empty((m, k))
     factor, whole = np.empty(covariance.shape), np.empty((m, k))
     for f in range(m):
         for r in range(k):
@@ -227,7 +234,10 @@ def normalise_pairs(covariance, residual, shared, first, second):
                 factor[f, r, c] = covariance[f, r, c]
         own[f], logs[f] = _normalised(factor[f], whole[f], residual[f], u[f])
     # Of the second one what the first one does not explain.
-    W, C, left, unused = np.empty((k, k)), np.empty((k, k)), np.empty(k), np.empty(k)
+    W = np.empty((k, k))
+    C = np.empty((k, k))
+    left = np.empty(k)
+    unused = np.empty(k)
     for pair in range(len(first)):
         a, b = first[pair], second[pair]
         for c in range(k):

@@ -76,7 +76,9 @@ def jacobians(z, x_i, x_j):
     """Return J_e_i and J_e_j, (m, 2, 6, 6)."""
     J = np.zeros((len(z), 2, 6, 6))
     J_i, J_j = J[:, 0], J[:, 1]
-    R_z, R_ij, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    R_z = np.empty((3, 3))
+    R_ij = np.empty((3, 3))
+    M = np.empty((3, 3))
     for f in range(len(z)):
         p, q_ij, q = _seen(z[f], x_i[f], x_j[f])
         _write_matrix((z[f, 3], z[f, 4], z[f, 5], z[f, 6]), R_z)
@@ -110,7 +112,9 @@ def _write_skew(v, matrix):
 def curvature(z, x_i, x_j, dual):
     """Return the rows of turns of the Hessian of dual'e, (m, 2, 3, 12); see `manifold`."""
     H = np.zeros((len(z), 2, 3, 12))
-    R, S, K = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    R = np.empty((3, 3))
+    S = np.empty((3, 3))
+    K = np.empty((3, 3))
     for f in range(len(z)):
         p, q_ij, q = _seen(z[f], x_i[f], x_j[f])
         # R(-q)' turns forwards.

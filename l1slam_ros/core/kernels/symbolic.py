@@ -73,7 +73,9 @@ def postorder(order, column, rows):
             parent[k] = min(parent[k], step[rows[at]])
         # The child with the longest column comes last, next to its parent, to be merged with it.
         sibling[k], child[parent[k]] = child[parent[k]], k
-    old, stack, place, top = np.empty(n, np.int32), np.empty(n + 1, np.int32), 0, 0
+    old = np.empty(n, np.int32)
+    stack = np.empty(n + 1, np.int32)
+    place, top = 0, 0
     stack[0] = n
     while top >= 0:
         k = stack[top]
@@ -90,7 +92,9 @@ def postorder(order, column, rows):
     new[n] = n
     for k in range(n):
         new[old[k]] = k
-    position, above, below = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int64)
+    position = np.empty(n, np.int32)
+    above = np.empty(n, np.int32)
+    below = np.empty(n, np.int64)
     for k in range(n):
         position[order[k]] = new[k]
         above[k] = new[parent[old[k]]]
@@ -196,7 +200,10 @@ def halves(first, start, pattern):
         crossing[lowest[s] + 1] += own[s]
         crossing[s + 1] -= own[s]
         whole += own[s]
-    cut, least, left, after = 0, np.inf, 0.0, 0.0
+    cut = 0
+    least = np.inf
+    left = 0.0
+    after = 0.0
     for s in range(count + 1):
         after += crossing[s]
         if max(left, whole - left - after) + after < least:
@@ -276,10 +283,14 @@ def block_addresses(keyframe, position, first, start, pattern, offset, stride, k
         s = owner[column]
         own[v] = stride[s]
         corner[v] = offset[s] + (column - first[s]) * k * (own[v] + 1)
-    address, width, turned = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m, np.bool_)
+    address = np.empty(m, np.int64)
+    width = np.empty(m, np.int64)
+    turned = np.empty(m, np.bool_)
     for f in range(m):
         i, j = keyframe[f, 0], keyframe[f, 1]
-        address[f], width[f], turned[f] = -1, 0, False
+        address[f] = -1
+        width[f] = 0
+        turned[f] = False
         if i < n and j < n:
             turned[f] = position[i] > position[j]
             row, v = (position[i], j) if turned[f] else (position[j], i)

@@ -45,7 +45,8 @@ FEWEST_SPARE = 20
 _ROUNDS = 8
 # The poses need not be exact for their residuals to have the right size: steps of Gauss-Newton at
 # most, each halved so often, and the part of chi2 that no longer matters; nor the ratios.
-_STEPS, _HALVINGS, _TOLERANCE = 20, 5, 1e-3
+_STEPS, _HALVINGS = 20, 5
+_TOLERANCE = 1e-3
 _SAME_RATIO = 0.01
 # Errors that many times as large, or as small, as their information says are worth a sentence.
 OFF_SCALE = 3.0
@@ -193,7 +194,9 @@ def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
     weights = 1 / np.repeat(variance[is_loop.astype(np.int64)], k)
     left = left_of(np.column_stack((b, G)))
     weighted = weights[:, None] * G
-    M, S, z = G.T @ weighted, left[:, 1:].T @ weighted, weighted.T @ left[:, 0]
+    M = G.T @ weighted
+    S = left[:, 1:].T @ weighted
+    z = weighted.T @ left[:, 0]
     scale = np.sqrt(np.where(np.diag(M) > 0, np.diag(M), 1.0))
     share, V = np.linalg.eigh(S / np.outer(scale, scale))
     V, share = V[:, share > _SHOWS**2] / scale[:, None], share[share > _SHOWS**2]

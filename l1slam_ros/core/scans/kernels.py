@@ -240,7 +240,10 @@ def cast_rays(log_odds, origin, resolution, starts, ends, hits, free, occupied, 
         x, y = (starts[k, 0] - origin[0]) / resolution, (starts[k, 1] - origin[1]) / resolution
         u, v = (ends[k, 0] - origin[0]) / resolution, (ends[k, 1] - origin[1]) / resolution
         dx, dy = u - x, v - y
-        column, row, last_column, last_row = int(x), int(y), int(u), int(v)
+        column = int(x)
+        row = int(y)
+        last_column = int(u)
+        last_row = int(v)
         step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
         next_x = ((column + (step_x > 0)) - x) / dx if dx != 0 else np.inf
         next_y = ((row + (step_y > 0)) - y) / dy if dy != 0 else np.inf

@@ -36,7 +36,9 @@ def add_widest_bounds(blocks, points, turns, start, sums, cells):
     more than a nobody asks, but so many are added in one step of the processor; cells : (t, n, 2)
     takes those of the points
     """
-    columns, rows, wide = blocks.shape[2], blocks.shape[3], np.uint64(sums.shape[2])
+    columns = blocks.shape[2]
+    rows = blocks.shape[3]
+    wide = np.uint64(sums.shape[2])
     for t in range(len(turns)):
         c, s = turns[t, 0], turns[t, 1]
         for k in range(len(points)):
@@ -72,7 +74,10 @@ def branch_and_bound(levels, cells, nodes, most, least, excluded, stack):
 
     """
     top = len(levels) - 1
-    best, turn, column, row = least, -1, 0, 0
+    best = least
+    turn = -1
+    column = 0
+    row = 0
     for at in range(len(nodes)):
         if nodes[at, 3] <= best:
             break
@@ -95,7 +100,10 @@ def branch_and_bound(levels, cells, nodes, most, least, excluded, stack):
 @compiled
 def _branch(levels, cells, most, best, stack, first):
     """Put the quarters of a node in its place on the stack, the best one on top; return depth."""
-    t, x, y, level = stack[first, 0], stack[first, 1], stack[first, 2], stack[first, 4] - 1
+    t = stack[first, 0]
+    x = stack[first, 1]
+    y = stack[first, 2]
+    level = stack[first, 4] - 1
     half, depth = 1 << level, first
     grid = levels[level]
     last_column, last_row = np.uint64(grid.shape[0] - 1), np.uint64(grid.shape[1] - 1)

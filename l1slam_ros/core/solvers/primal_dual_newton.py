@@ -46,7 +46,9 @@ from l1slam_ros.core.solvers.optimality import SmoothNorm, Status, fits_exactly,
 _TOLERANCE = 1e-6
 # What mu becomes of itself after a full step of poses and dual, and where there was none; and at
 # first of the mean length.
-_FALLS, _FALLS_SLOWLY, _FIRST = 0.1, 0.7, 0.5
+_FALLS = 0.1
+_FALLS_SLOWLY = 0.7
+_FIRST = 0.5
 # How far to go towards the bound of the dual, and how often a step is halved.
 _FRACTION, _HALVINGS = 0.99, 12
 

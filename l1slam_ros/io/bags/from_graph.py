@@ -156,7 +156,9 @@ def _note(graph: FactorGraph, stamps: list[int]) -> dict[str, str]:
     A graph may have equal loops, longer steps than robots take, years between its keyframes, and
     unusual variances. The note then says that each message is to be taken as it is.
     """
-    factors, steps, loops = graph.between, steps_of(graph), loops_of(graph)
+    factors = graph.between
+    steps = steps_of(graph)
+    loops = loops_of(graph)
     equal = np.concatenate((factors.pairs[loops], factors.measurement[loops]), axis=1)
     seconds = np.diff(stamps) * 1e-9
     manifold = graph.manifold

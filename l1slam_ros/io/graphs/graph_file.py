@@ -286,7 +286,9 @@ def graph_lines(path: Path, record: GraphRecord) -> list[str]:
 
 def _factor_lines(path: Path, record: GraphRecord, graph: FactorGraph) -> np.ndarray:
     """Return the line of each factor of a graph, (m,)."""
-    factors, pairs, kinds = graph.between, record.ids[graph.between.pairs], _kinds(graph)
+    factors = graph.between
+    pairs = record.ids[graph.between.pairs]
+    kinds = _kinds(graph)
     texts = np.empty(len(factors), object)
     for kind in np.unique(kinds):
         rows = np.flatnonzero(kinds == kind)

@@ -35,7 +35,9 @@ def take_part(own, number, start, adjacent, part, local, pool):
     """
     first, neighbour, heavy, weight, _, ends = pool
     for k in range(len(own)):
-        part[own[k]], local[own[k]], weight[k] = number, k, 1
+        part[own[k]] = number
+        local[own[k]] = k
+        weight[k] = 1
     at = 0
     for k in range(len(own)):
         first[k] = at
@@ -125,7 +127,9 @@ def _merge(graph, into, count, new_start, new_adjacent, new_heavy, new_weight, l
     start, adjacent, heavy, weight = graph
     members, place = lists[:2], lists[2]
     for c in range(count):
-        members[0, c], place[c], new_weight[c] = -1, -1, 0
+        members[0, c] = -1
+        place[c] = -1
+        new_weight[c] = 0
     for k in range(len(into)):
         c = into[k]
         members[1, c] = k
@@ -142,7 +146,9 @@ def _merge(graph, into, count, new_start, new_adjacent, new_heavy, new_weight, l
                 if v == c:
                     continue
                 if place[v] < begin:
-                    place[v], new_adjacent[at], new_heavy[at] = at, v, 0
+                    place[v] = at
+                    new_adjacent[at] = v
+                    new_heavy[at] = 0
                     at += 1
                 new_heavy[place[v]] += heavy[edge]
         new_start[c + 1] = at

@@ -87,7 +87,10 @@ def _back(pool, level, to, side, sides, space):
 @compiled
 def _first_cut(graph, sides, space):
     """Return the best of some cuts of a small graph, each grown around a node anywhere."""
-    n, least, own, best = len(graph[3]), np.inf, 0, 1
+    n = len(graph[3])
+    least = np.inf
+    own = 0
+    best = 1
     for attempt in range(_TRIES):
         side = sides[own][:n]
         _grow(graph, attempt * 7919 % n, side, space)
@@ -104,7 +107,9 @@ def _first_cut(graph, sides, space):
 @compiled
 def _costs(graph, side):
     """Return the weight of the separator, a little more where it cuts unevenly."""
-    left, right, between = 0, 0, 0
+    left = 0
+    right = 0
+    between = 0
     for k in range(len(side)):
         if side[k] == _BETWEEN:
             between += graph[3][k]
@@ -119,7 +124,12 @@ def _costs(graph, side):
 def _grow(graph, root, side, space):
     """Write a cut: half of the weight around a root, and the nodes behind that touch it."""
     start, adjacent, _, weight = graph
-    queue, at, end, grown, other, total = space[3], 0, 0, 0, 0, 0
+    queue = space[3]
+    at = 0
+    end = 0
+    grown = 0
+    other = 0
+    total = 0
     for k in range(len(side)):
         side[k] = -1
         total += weight[k]
@@ -147,7 +157,9 @@ def _grow(graph, root, side, space):
 @compiled
 def _improve(graph, side, space):
     """Move nodes out of the separator, and their neighbours into it, while it gets lighter."""
-    weights, locked, total = space[4][0], space[2], 0
+    weights = space[4][0]
+    locked = space[2]
+    total = 0
     weights[0] = weights[1] = weights[2] = 0
     for k in range(len(side)):
         weights[side[k]] += graph[3][k]
@@ -161,14 +173,19 @@ def _improve(graph, side, space):
 @compiled
 def _pass(graph, side, space, most, turn):
     """Do one pass of moves and undo those behind the best; False: it found nothing better."""
-    heaps, locked, undo, counts = space[1], space[2], space[3], space[4]
+    heaps = space[1]
+    locked = space[2]
+    undo = space[3]
+    counts = space[4]
     weights, size = counts[0], counts[1]
     size[0] = size[1] = 0
     for k in range(len(side)):
         if side[k] == _BETWEEN:
             _enter(k, graph, side, space)
     least, uneven = weights[2], abs(weights[0] - weights[1])
-    done, kept, since = 0, 0, 0
+    done = 0
+    kept = 0
+    since = 0
     while since < _HOPE:
         to = _choose(graph, side, space, most, turn)
         if to < 0:
@@ -179,7 +196,10 @@ def _pass(graph, side, space, most, turn):
         since += 1
         now = abs(weights[0] - weights[1])
         if weights[2] < least or (weights[2] == least and now < uneven):
-            least, uneven, kept, since = weights[2], now, done, 0
+            least = weights[2]
+            uneven = now
+            kept = done
+            since = 0
     _undo(graph[3], side, weights, undo, done, kept)
     return kept > 0
 
@@ -188,7 +208,11 @@ def _pass(graph, side, space, most, turn):
 def _move(k, to, graph, side, space, done):
     """Let a node leave to a side; what it touches on the other side comes in."""
     start, adjacent, _, weight = graph
-    pulled, heaps, undo, weights, size = space[0], space[1], space[3], space[4][0], space[4][1]
+    pulled = space[0]
+    heaps = space[1]
+    undo = space[3]
+    weights = space[4][0]
+    size = space[4][1]
     weights[2] -= weight[k]
     weights[to] += weight[k]
     side[k] = to
@@ -236,7 +260,9 @@ def _undo(weight, side, weights, undo, done, kept):
 def _enter(k, graph, side, space):
     """Let a node that came into the separator wait for its turn to leave it."""
     start, adjacent, _, weight = graph
-    pulled, heaps, size = space[0], space[1], space[4][1]
+    pulled = space[0]
+    heaps = space[1]
+    size = space[4][1]
     pulled[0, k] = pulled[1, k] = 0
     for v in adjacent[start[k]:start[k + 1]]:
         if side[v] < _BETWEEN:
@@ -284,7 +310,9 @@ def _push(heaps, size, to, k, gain):
 def _pop(heap, size, to):
     """Take the top from the heap of a side."""
     size[to] -= 1
-    entry, at, end = heap[size[to]], 0, size[to]
+    entry = heap[size[to]]
+    at = 0
+    end = size[to]
     while 2 * at + 1 < end:
         child = 2 * at + 1
         if child + 1 < end and heap[child + 1] > heap[child]:

@@ -52,7 +52,9 @@ _FINER, _FINE = 5, 0.02
 # Nearly as likely as the likeliest is none with this part of its odds to all loops being lies, and
 # worth a look another drift: loops of a lap share much of their errors, so that odds are less than
 # they seem. So many are looked at most.
-_NONE, _ANOTHER, _TRIED = 0.75, 0.5, 8
+_NONE = 0.75
+_ANOTHER = 0.5
+_TRIED = 8
 # What the odometry states of its turns may be off by, in variance.
 _NOISE = np.logspace(-3, 3, 13)
 # Rounds of expectation and maximisation of the share of true loops.

@@ -50,7 +50,9 @@ _CHANCES = 2
 _KNOWN = 20
 # Noise that is so many times the variance that was found is measured anew before any loop is
 # dropped for it, by the median of chi2 over its freedom; by factors that others check at all.
-_NOISIER, _MEDIAN, _CHECKED = 3.0, 0.79, 0.01
+_NOISIER = 3.0
+_MEDIAN = 0.79
+_CHECKED = 0.01
 # While driving so many of the last absolute factors are looked at, with their neighbours.
 _LATEST = 50
 # The variance of an odometry factor that was cut, in units of its own: loops alone decide, and far
@@ -83,7 +85,9 @@ class Growth:
         self._order: ChangingOrder | None = None
         self.slip_odds: dict[int, float] = {}
         none = np.zeros(len(given.factors), bool)
-        self.ventured, self.in_tail, self.drops = none, ~none, none.astype(np.int64)
+        self.ventured = none
+        self.in_tail = ~none
+        self.drops = none.astype(np.int64)
 
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large the noise is."""
