@@ -302,21 +302,23 @@ class ScanOdometry:
         if self._unmatched or done < 1.0:
             return Step(self._pose, None, covariance, said)
         keyframe = Keyframe(stamp, self._pose, points, last.part, last.travelled + way)
-        said = '; '.join(filter(None, (said, self._said_of_length(moved))))
+        said = '; '.join(filter(None, (said, self._said_of_length(moved, way))))
         self._keep(keyframe)
         return Step(self._pose, keyframe, covariance, said)
 
-    def _said_of_length(self, moved: Array) -> str:
+    def _said_of_length(self, moved: Array, way: float) -> str:
         """
         Return what is to be said where scans do not show how far the robot went, once a stretch.
 
         That is, they took less than half of the variance along each motion (3,) of it.
+
+        way : the length of this one [m]
         """
         along = rotated(np.array([0.0, 0.0, -moved[2]]), moved[None, :2])[0]
         known = along @ self._covariance[:2, :2] @ along
         before = self._by_wheels
         by_wheels = 2 * known > along @ self._untold[:2, :2] @ along
-        self._by_wheels = before + float(np.hypot(*moved[:2])) if by_wheels else 0.0
+        self._by_wheels = before + way if by_wheels else 0.0
         return _BY_WHEELS if before < _LONG <= self._by_wheels else ''
 
     def _begin(self, stamp: int, points: Points, said: str = '') -> Step:
