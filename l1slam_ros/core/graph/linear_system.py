@@ -55,6 +55,11 @@ class LinearSystem:
         return int(self.blocks.shape[-1])
 
     @cached_property
+    def residual(self) -> Array:
+        """The whitened residual where the system was linearised, -b, (rows,)."""
+        return -self.b
+
+    @cached_property
     def A(self) -> 'csr_array':
         """(rows, columns) CSR without the zeros of the blocks."""
         from scipy.sparse import csr_array

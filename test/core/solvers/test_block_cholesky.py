@@ -359,6 +359,18 @@ def test_only_what_takes_very_long_is_ordered_by_separators(monkeypatch):
     assert asked == [10_000]
 
 
+def test_of_a_crowded_graph_nothing_but_minimum_degree_is_tried(monkeypatch):
+    """Levels and separators save nothing where each keyframe has many neighbours."""
+    asked = []
+    for kernel in kernels.ordering, kernels.dissection:
+        monkeypatch.setattr(kernel, 'dissect', lambda start, adjacent: (
+            asked.append(len(start) - 1) or np.zeros(len(start) - 1, np.int32)))
+    for size in (20, 40):
+        pairs = np.stack(np.triu_indices(size, 1), axis=1)
+        assert find_pattern(pairs, size, PLENTY, 24).work * 24**3 > 8000 * size
+    assert asked == [20]
+
+
 def test_a_graph_that_grows_keeps_its_order_for_a_while(rng):
     """Until it has a tenth more keyframes, or if all that is kept would be too much."""
     pairs = np.array(random_loops(N))
