@@ -120,6 +120,7 @@ class LoopFinder:
         self._asked_at = -np.inf  # [m] the way to the last that asked
         # Of each keyframe that may be asked for.
         self._looks: list[Array] = []
+        self._views: list[Array] = []
         self._travelled: list[float] = []
         self._part: list[int] = []
         self._waiting: deque[_Comparison] = deque()
@@ -145,12 +146,15 @@ class LoopFinder:
         """
         for k in range(len(self._part), j + 1):
             self._looks.append(self._submaps[k].descriptor)
+            xy = self._submaps[k].xy
+            self._views.append(np.array([*(xy.mean(axis=0) if len(xy) else (0.0, 0.0)), 0.0]))
             self._travelled.append(self._keyframes[k].travelled)
             self._part.append(self._keyframes[k].part)
         sigma = self._sigma(j, spread)
-        reach = np.clip(_SIGMAS * sigma[:, 0], _LEAST_REACH, _MOST_REACH)
+        unsure = _SIGMAS * sigma[:, 0]
+        reach = np.clip(unsure, _LEAST_REACH, _MOST_REACH)
         turn = np.clip(_SIGMAS * sigma[:, 1], _LEAST_TURN, np.pi)
-        for i, alike in self._candidates(j, poses, reach):
+        for i, alike in self._candidates(j, poses, reach, np.maximum(2 * reach, unsure)):
             expected = se2.between(poses[i][None], poses[j][None])[0]
             self._waiting.append(
                 _Comparison(i, j, alike, expected, float(reach[i]), float(turn[i])))
@@ -188,17 +192,18 @@ class LoopFinder:
         by_map = np.hypot(np.where(known[:, None], spread, np.inf)[:j], max(since, 0.0) * _DRIFT)
         return np.fmin(way[:, None] * _DRIFT, by_map)
 
-    def _candidates(self, j: int, poses: Array, reach: Array) -> list[tuple[int, bool]]:
+    def _candidates(self, j: int, poses: Array, reach: Array, alike_reach: Array) -> list[tuple[int, bool]]:
         """Return keyframes to compare with, and whether for their looks alone."""
         travelled, part = np.array(self._travelled[: j + 1]), np.array(self._part[: j + 1])
         far = np.flatnonzero(
             (travelled[j] - travelled > self._options.apart) | (part != part[j]))
-        distance = np.hypot(*(poses[far, :2] - poses[j, :2]).T)
+        views = se2.compose(poses[: j + 1], np.array(self._views[: j + 1]))
+        distance = np.hypot(*(views[far, :2] - views[j, :2]).T)
         apart = (part != part[j])[far]
         near = (distance <= reach[far]) & ~apart
         chosen: list[tuple[int, bool]] = []
         self._take(far[near], distance[near], _NEAREST, False, travelled, chosen)
-        within = far[(distance <= 2 * reach[far]) | apart]
+        within = far[(distance <= alike_reach[far]) | apart]
         looks = np.array([self._looks[i] for i in within]).reshape(-1, LOOKS) @ self._looks[j]
         alike = looks > _SIMILAR
         self._take(within[alike], -looks[alike], _ALIKE, True, travelled, chosen)
