@@ -147,6 +147,7 @@ class LoopFinder:
         for k in range(len(self._part), j + 1):
             self._looks.append(self._submaps[k].descriptor)
             xy = self._submaps[k].xy
+            xy = xy[np.hypot(*xy.T) < _MOST_REACH]
             self._views.append(np.array([*(xy.mean(axis=0) if len(xy) else (0.0, 0.0)), 0.0]))
             self._travelled.append(self._keyframes[k].travelled)
             self._part.append(self._keyframes[k].part)
