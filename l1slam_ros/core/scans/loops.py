@@ -10,8 +10,8 @@
 Loop closures from scans: which keyframes to compare, and whether they show one place.
 
 In: keyframes, where the map has them, and how certain that is. Out: loops with covariances. A
-keyframe asks for the nearest ones in the map and for those that look alike; each is searched for
-without a guess, matched, and believed only if
+keyframe asks for those that saw nearly the same by the map, and for those that look alike as far
+as the map may be off; each is searched for without a guess, matched, and believed only if
 
     the score of the search and the overlap are high,
     no other place within reach fits nearly as well (two equal rooms, a corridor),
@@ -36,7 +36,7 @@ from l1slam_ros.core.scans.submaps import AROUND, LOOKS, Keyframe, Submap, Subma
 
 # [m] A keyframe asks so far from the last one that did: submaps of neighbours show the same.
 _ASK_WAY = 1.0
-# So many candidates by their place in the map, and so many by their looks.
+# So many candidates by where in the map they saw something, and so many by their looks.
 _NEAREST, _ALIKE = 2, 2
 # Cosine of two descriptors.
 _SIMILAR = 0.75
@@ -55,7 +55,7 @@ _SCORE = 0.42
 _RIVAL = 0.85
 _OVERLAP = 0.3
 _AGREE = 0.93
-_HELD = 0.05
+_HELD = 0.02
 # [m] A match that goes so far from the peak of the search slides.
 _WANDER = 0.4
 # Of neighbouring keyframes' submaps much is the same: a loop is half as certain as matches say.
@@ -120,6 +120,7 @@ class LoopFinder:
         self._asked_at = -np.inf  # [m] the way to the last that asked
         # Of each keyframe that may be asked for.
         self._looks: list[Array] = []
+        self._middles: list[Array] = []
         self._travelled: list[float] = []
         self._part: list[int] = []
         self._waiting: deque[_Comparison] = deque()
@@ -145,12 +146,14 @@ class LoopFinder:
         """
         for k in range(len(self._part), j + 1):
             self._looks.append(self._submaps[k].descriptor)
+            self._middles.append(np.array([*self._submaps[k].middle(_MOST_REACH), 0.0]))
             self._travelled.append(self._keyframes[k].travelled)
             self._part.append(self._keyframes[k].part)
         sigma = self._sigma(j, spread)
-        reach = np.clip(_SIGMAS * sigma[:, 0], _LEAST_REACH, _MOST_REACH)
+        unsure = _SIGMAS * sigma[:, 0]
+        reach = np.clip(unsure, _LEAST_REACH, _MOST_REACH)
         turn = np.clip(_SIGMAS * sigma[:, 1], _LEAST_TURN, np.pi)
-        for i, alike in self._candidates(j, poses, reach):
+        for i, alike in self._candidates(j, poses, reach, np.maximum(unsure, 2 * reach)):
             expected = se2.between(poses[i][None], poses[j][None])[0]
             self._waiting.append(
                 _Comparison(i, j, alike, expected, float(reach[i]), float(turn[i])))
@@ -188,17 +191,24 @@ class LoopFinder:
         by_map = np.hypot(np.where(known[:, None], spread, np.inf)[:j], max(since, 0.0) * _DRIFT)
         return np.fmin(way[:, None] * _DRIFT, by_map)
 
-    def _candidates(self, j: int, poses: Array, reach: Array) -> list[tuple[int, bool]]:
-        """Return keyframes to compare with, and whether for their looks alone."""
+    def _candidates(self, j: int, poses: Array, reach: Array, alike_reach: Array
+                    ) -> list[tuple[int, bool]]:
+        """
+        Return keyframes to compare with, and whether for their looks alone.
+
+        Near are those that saw nearly the same: of a laser that looks ahead, and comes back the
+        other way, these are not where it stood.
+        """
         travelled, part = np.array(self._travelled[: j + 1]), np.array(self._part[: j + 1])
         far = np.flatnonzero(
             (travelled[j] - travelled > self._options.apart) | (part != part[j]))
-        distance = np.hypot(*(poses[far, :2] - poses[j, :2]).T)
+        seen = se2.compose(poses[: j + 1], np.array(self._middles[: j + 1]))
+        distance = np.hypot(*(seen[far, :2] - seen[j, :2]).T)
         apart = (part != part[j])[far]
         near = (distance <= reach[far]) & ~apart
         chosen: list[tuple[int, bool]] = []
         self._take(far[near], distance[near], _NEAREST, False, travelled, chosen)
-        within = far[(distance <= 2 * reach[far]) | apart]
+        within = far[(distance <= alike_reach[far]) | apart]
         looks = np.array([self._looks[i] for i in within]).reshape(-1, LOOKS) @ self._looks[j]
         alike = looks > _SIMILAR
         self._take(within[alike], -looks[alike], _ALIKE, True, travelled, chosen)

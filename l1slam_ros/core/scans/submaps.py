@@ -83,6 +83,11 @@ class Submap:
         spectrum: Array = np.abs(np.fft.rfft(np.sqrt(seen), axis=1)).astype(float).ravel()
         return spectrum / max(float(np.linalg.norm(spectrum)), 1e-12)
 
+    def middle(self, within: float) -> Array:
+        """Return the mean of the points not further than so much [m], (2,); zero if none is."""
+        near = self.xy[np.hypot(self.xy[:, 0], self.xy[:, 1]) < within]
+        return near.mean(axis=0) if len(near) else np.zeros(2)
+
 
 def submap_of(keyframes: Sequence[Keyframe], at: int, before: int = AROUND, after: int = AROUND
               ) -> Submap:

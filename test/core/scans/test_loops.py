@@ -8,6 +8,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loops: one place is known again, and what only looks like it is not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rooms import WALLS, along, box, glass, mirrored, random_rays, ranges_at, scan_at
@@ -15,7 +17,7 @@ from rooms import WALLS, along, box, glass, mirrored, random_rays, ranges_at, sc
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.scans.loops import LoopFinder
 from l1slam_ros.core.scans.points import Scan, points_of
-from l1slam_ros.core.scans.submaps import Keyframe
+from l1slam_ros.core.scans.submaps import AROUND, Keyframe
 
 # Along one side of a block, and back on the way where the robot came from, half a metre aside.
 OUT = along(np.array([(1.2, 1.4), (10.4, 1.4)]), 0.5)
@@ -42,7 +44,8 @@ def loops_of(keyframes, first, off=(0.0, 0.0, 0.0), sigma=(1.0, 0.1)):
     poses = np.array([keyframe.pose for keyframe in keyframes])
     poses[first:] = se2.compose(np.tile(off, (len(poses) - first, 1)), poses[first:])
     finder, spread = LoopFinder(keyframes), np.tile(sigma, (len(keyframes), 1))
-    for j in range(first, len(keyframes)):
+    # The maps of the first few would hold keyframes from before the jump, too.
+    for j in range(first + AROUND, len(keyframes)):
         finder.ask(j, poses, spread)
     return finder.find(finder.waiting)
 
@@ -127,3 +130,33 @@ def test_keyframes_ask_by_the_way_and_not_by_their_number(step, ask):
         growing.append(Keyframe(k, np.array((step * k, 0.0, 0.0)), points, 0, step * k))
         due += finder.due().tolist()
     assert due == list(range(4, 36, ask))
+
+
+@pytest.mark.parametrize(('first', 'last', 'compared'), [
+    ((2.0, 1.5, 0.0), (9.0, 1.5, np.pi), 1), ((5.0, 1.5, np.pi), (6.0, 1.5, 0.0), 0)])
+def test_what_is_compared_saw_the_same_whether_or_not_it_stood_there(first, last, compared):
+    """Of a laser that looks ahead: of two that face each other, and of two back to back."""
+    def ahead(ranges, *_):
+        ranges[60:-60] = np.inf
+        return ranges
+
+    def nothing(ranges, *_):
+        return np.full_like(ranges, np.inf)
+
+    keyframes = keyframes_at(np.array([first]), spoil=ahead)
+    keyframes = keyframes_at(np.full((9, 3), 100.0), spoil=nothing, start=keyframes)
+    keyframes = keyframes_at(np.array([last]), spoil=ahead, start=keyframes)
+    finder = LoopFinder(keyframes)
+    finder.ask(10, np.array([keyframe.pose for keyframe in keyframes]), np.ones((11, 2)))
+    assert finder.waiting == compared
+
+
+@pytest.mark.parametrize(('off', 'found'), [(30.0, True), (60.0, False)])
+def test_a_place_is_known_by_its_looks_as_far_as_the_map_may_be_off(off, found):
+    """A search reaches 8 m, but what looks alike is compared within three deviations, 45 m."""
+    again = [replace(keyframe, travelled=keyframe.travelled + 1000.0)
+             for keyframe in keyframes_at(OUT, seed=1)]
+    keyframes = keyframes_at(OUT) + again
+    loops = loops_of(keyframes, len(OUT), off=(off, 0.0, 0.0), sigma=(15.0, 1.0))
+    assert bool(loops) == found
+    assert not found or np.hypot(*errors(loops, keyframes)[:, :2].T).max() < 0.1
