@@ -90,7 +90,9 @@ def test_the_printed_iterates_are_those_of_algorithm_2(world, seed):
 
 
 def test_algorithm_4_as_printed_takes_full_steps_from_a_cold_dual(world):
-    told, poses, expected = [], world.odometry, [cost(world.graph, world.odometry)]
+    told = []
+    poses = world.odometry
+    expected = [cost(world.graph, world.odometry)]
     for _ in range(3):
         *_, (x, _) = islice(algorithm_2(linearise(world.graph, poses)), LITTLE.inner)
         poses = step_poses(world.graph, poses, x)
