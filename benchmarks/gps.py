@@ -54,7 +54,9 @@ def told_everything(graph: l1.FactorGraph, truth: Array, false: Indices) -> Arra
     true = graph.subset(np.setdiff1d(np.arange(len(graph.between)), false))
     between = true.between
     steps = ~between.is_absolute
-    i, j, Z = between.i[steps], between.j[steps], between.measurement[steps]
+    i = between.i[steps]
+    j = between.j[steps]
+    Z = between.measurement[steps]
     error = se2.local(se2.between(truth[i], truth[j]), Z)
     told = l1.FactorGraph(se2)
     told.add_poses(graph.n_poses)

@@ -201,7 +201,9 @@ def _live(backend: Backend, messages: Iterator[Message], rate: float) -> None:
 
 def _ask(backend: Backend, over: threading.Event, until_saved: float) -> None:
     """Ask for all keyframes now and then, and save the map once."""
-    took, began, saved = [], time.monotonic(), False
+    took = []
+    began = time.monotonic()
+    saved = False
     while not over.wait(_DRAWN_EVERY):
         with _timed() as drawn:
             _ = backend.snapshot().drawn
@@ -226,7 +228,9 @@ def _save(backend: Backend) -> None:
 @contextmanager
 def _timed() -> Iterator[list[float]]:
     """Give a list for what the block takes: wall and processor time [s] of this thread."""
-    found, wall, cpu = [], time.perf_counter(), time.thread_time()
+    found = []
+    wall = time.perf_counter()
+    cpu = time.thread_time()
     yield found
     found += time.perf_counter() - wall, time.thread_time() - cpu
 

@@ -39,7 +39,9 @@ from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 # Of the odometry, and of loops.
 NORMS = (('l1', SAME), ('group-l1', SAME), ('l2', 'group-l1'), ('l2', 'l1'), ('huber', SAME))
-_OUTLIERS, _TIMES, _FREEDOM = 0.05, 6.0, 3
+_OUTLIERS = 0.05
+_TIMES = 6.0
+_FREEDOM = 3
 
 
 def normal(graph: FactorGraph, rng: np.random.Generator) -> Array:

@@ -44,6 +44,16 @@ def pytest_sessionstart(session):
             compile_now(STEPS)
 
 
+def pytest_collection_modifyitems(items):
+    """
+    Begin with the modules of this folder, which build, install and run what the pages say.
+
+    They take longest: last, one worker would still be at them when the other has nothing left, and
+    where it has taken over some of a module, both would build what its tests share.
+    """
+    items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
+
+
 @pytest.fixture
 def rng():
     """Return a generator with a fixed seed: a failing test fails again."""

@@ -24,7 +24,9 @@ class Disk:
     """
 
     def __init__(self, monkeypatch, folder, failing=None, seen=lambda: None):
-        self.failing, self.seen, self.calls = failing, seen, []
+        self.failing = failing
+        self.seen = seen
+        self.calls = []
         self._contents, self._names = {}, {}  # what is on the disk, by inode
         for path in [folder, *folder.rglob('*')]:
             self._sync(path)

@@ -17,7 +17,9 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 
 # At 1 m/s round four corners of 1 m radius.
-LAP, RATE, START = 40.0, 20.0, 100.0  # [s], [1/s], [s]
+LAP = 40.0  # [s]
+RATE = 20.0  # [1/s]
+START = 100.0  # [s]
 _SIDE, _CORNER = LAP / 4, np.pi / 2
 LOOP_SIGMA = np.array([0.05, 0.05, 0.02])
 
@@ -46,7 +48,9 @@ class Laps:
 
     def __init__(self, seed=0, laps=3.0, twist=False, rate=RATE, speed=1.0):
         rng = np.random.default_rng(seed)
-        self.period, self.speed, self.lap = 1 / rate, speed, LAP / speed
+        self.period = 1 / rate
+        self.speed = speed
+        self.lap = LAP / speed
         self.times = np.arange(round(laps * self.lap * rate)) / rate
         truth = at(self.times * speed)
         steps = se2.between(truth[:-1], truth[1:])
@@ -95,7 +99,9 @@ class Laps:
 
     def heard(self, samples):
         """Return samples, in the order they come, and each loop as soon as its end is over."""
-        loops, newest, found = list(self.loops), 0, []
+        loops = list(self.loops)
+        newest = 0
+        found = []
         for sample in samples:
             found.append(sample)
             newest = max(newest, sample.stamp)

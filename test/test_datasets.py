@@ -57,7 +57,9 @@ class Dataset:
 
     def __init__(self, folder, known):
         record = read_graph_file(folder / f'{known.name}.g2o')
-        self.known, self.graph, self.stored = known, record.graph, record.poses
+        self.known = known
+        self.graph = record.graph
+        self.stored = record.poses
 
     @cached_property
     def odometry(self):

@@ -87,7 +87,10 @@ class Block(NamedTuple):
 
 def blocks(page):
     """Return the fenced blocks of a page."""
-    found, heading, language, lines = [], '', None, []
+    found = []
+    heading = ''
+    language = None
+    lines = []
     for line in page.read_text().splitlines():
         if language is None and line.startswith('#'):
             heading = line.lstrip('# ')

@@ -185,7 +185,10 @@ def test_modules_say_their_licence_and_what_they_are(module):
 
 
 # A reader holds each class and function at once.
-MOST_ATTRIBUTES, MOST_METHODS, MOST_CODE, MOST_OF_A_FUNCTION = 15, 25, 260, 40
+MOST_ATTRIBUTES = 15
+MOST_METHODS = 25
+MOST_CODE = 260
+MOST_OF_A_FUNCTION = 40
 # What runs while a robot drives.
 RUNNING = [name for name in FILES if name.startswith(tuple(
     f'{PACKAGE}.core.{part}' for part in ('bordered', 'graph', 'running')))]

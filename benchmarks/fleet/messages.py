@@ -39,7 +39,9 @@ def main() -> None:
     parser.add_argument('--odometry', type=float, default=10.0, help='[1/s]')
     parser.add_argument('--keyframes', type=int, default=10_000, help='of one robot')
     arguments = parser.parse_args()
-    now, pose, covariance = 10**18, np.eye(7)[6], np.eye(6)
+    now = 10**18
+    pose = np.eye(7)[6]
+    covariance = np.eye(6)
     stamps = np.full(arguments.keyframes, now)
     to_node = (
         ('odom', arguments.odometry, odometry_bytes('r1/odom', 'r1/base_link', now, pose,

@@ -37,7 +37,9 @@ from l1slam_ros.io.graphs.robots import keyframes_of
 from l1slam_ros.io.jrl.reading import read_jrl_file
 from l1slam_ros.io.jrl.writing import write_jrl_file
 
-ROBOTS, POSES, STEP = 5, 4470, 2.0
+ROBOTS = 5
+POSES = 4470
+STEP = 2.0
 # Within a robot and between robots: loops, and how many of them are false.
 LOOPS, FALSE = (1151, 868), (41, 25)
 # So many times as many are drawn, of which some are chosen: true ones, and false ones, of which
@@ -104,7 +106,9 @@ def line(name: str, kind: str, seed: int) -> str:
         false &= ~read.graph.between.is_odometry
         write_jrl_file(path, replace(read, log=replace(read.log, false=false)))
         read = read_jrl_file(path)
-    graph, false, positions = read.graph, read.log.known_false, read.graph.manifold.positions
+    graph = read.graph
+    false = read.log.known_false
+    positions = read.graph.manifold.positions
     outcome = solve(graph, None, SolveOptions())
     best = solve(graph.subset(~false), None, SolveOptions(robust=False))
     ours, known = (absolute_trajectory_error(positions(of.solution.poses),

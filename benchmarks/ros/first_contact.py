@@ -41,7 +41,9 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.ros.shell.header import header
 
-LOOPS, POSES, EDGES = 20_000, 50_000, 80_000
+LOOPS = 20_000
+POSES = 50_000
+EDGES = 80_000
 _SECOND = 10**9  # [ns]
 _QUIET = 10.0  # [s] without an update: the map has settled
 _WATCHED = 15.0  # [s] over which processor's time is taken
@@ -146,7 +148,9 @@ def _bare() -> None:
         while not publisher.get_subscription_count():
             time.sleep(_STANDING)
         time.sleep(1.0)
-        cpu, began, count = cpu_seconds(process.pid), time.monotonic(), 0
+        cpu = cpu_seconds(process.pid)
+        began = time.monotonic()
+        count = 0
         while (spent := time.monotonic() - began) < _WATCHED:
             publisher.publish(Odometry(header=header('odom', 1 + count)))
             count += 1

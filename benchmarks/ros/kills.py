@@ -35,7 +35,9 @@ from l1slam_ros.io.bags.topics import ODOMETRY_TOPIC
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages.conversion import stamp_of
 
-KILLS, POSES, EDGES = 60, 3000, 4800
+KILLS = 60
+POSES = 3000
+EDGES = 4800
 _PERIOD = 1.0  # [s] from autosave to autosave
 _RATE = 30.0  # [Hz] of the odometry
 _LONGEST = 3.0  # [s] from the first message to the kill

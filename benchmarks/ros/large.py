@@ -96,8 +96,12 @@ def _measure(peer: Peer, seconds: float, rate: float, loops: float) -> None:
 
 def _drive(peer: Peer, over: threading.Event, rate: float, loops: float) -> None:
     """Send odometry of a straight drive, and loops that say the same."""
-    odometry, loop, rng = some_odometry(), some_loop(), np.random.default_rng(0)
-    began, count, closed = time.monotonic_ns(), 0, 0
+    odometry = some_odometry()
+    loop = some_loop()
+    rng = np.random.default_rng(0)
+    began = time.monotonic_ns()
+    count = 0
+    closed = 0
     while not over.is_set():
         now = (time.monotonic_ns() - began) * 1e-9
         place(odometry, began, now, _SPEED)
@@ -115,7 +119,9 @@ def _drive(peer: Peer, over: threading.Event, rate: float, loops: float) -> None
 
 def _late_joiner() -> float:
     """Return after what time somebody new has the Path [s]."""
-    node, came, began = rclpy.create_node('late'), list[bytes](), time.monotonic()
+    node = rclpy.create_node('late')
+    came = list[bytes]()
+    began = time.monotonic()
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     node.create_subscription(PathMessage, 'path', came.append, latched, raw=True)
     executor = SingleThreadedExecutor()

@@ -41,7 +41,9 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.ros.shell.header import header
 
-KEYFRAMES, SECONDS, TURNS = 10_000, 5.0, 12
+KEYFRAMES = 10_000
+SECONDS = 5.0
+TURNS = 12
 _BETWEEN = 1.5  # [s] from one turn to the next: who begins to look is sent all of the graph
 _RATE, _STEP = 50.0, 0.05  # [1/s], [m]: five keyframes a second
 
@@ -66,7 +68,9 @@ class Probe:
 
     def drive(self, seconds: float) -> tuple[list[float], list[bool]]:
         """Send odometry; return how late each pose was [s], and which transforms were older."""
-        self._late, self._old, began = [], [], time.monotonic()
+        self._late = []
+        self._old = []
+        began = time.monotonic()
         for k in range(int(seconds * _RATE)):
             while (left := began + k / _RATE - time.monotonic()) > 0:
                 rclpy.spin_once(self.node, timeout_sec=left)
@@ -136,7 +140,9 @@ def _tell(late: list[list[float]], old: list[bool]) -> None:
 def _look() -> int:
     """Take markers while told to look; print how many bytes."""
     rclpy.init()
-    node, sizes, subscription = rclpy.create_node('looker'), [0], None
+    node = rclpy.create_node('looker')
+    sizes = [0]
+    subscription = None
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     threading.Thread(target=executor.spin, daemon=True).start()

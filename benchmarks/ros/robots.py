@@ -174,7 +174,9 @@ def _come(drive: Drive, backend: Backend, at: int) -> None:
 
 def rendezvous(keyframes: int) -> None:
     """Print what it takes to join two maps."""
-    drive, between, seconds = Drive(keyframes, 2), [], []
+    drive = Drive(keyframes, 2)
+    between = []
+    seconds = []
     with Backend(_OPTIONS) as backend:
         for at in range(keyframes):
             drive.add(backend, at)

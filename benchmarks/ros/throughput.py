@@ -39,7 +39,10 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.ros.shell.header import header
 
-SECONDS, RATE, LOOPS, KEYFRAMES = 60.0, 1_000.0, 100.0, 10_000
+SECONDS = 60.0
+RATE = 1_000.0
+LOOPS = 100.0
+KEYFRAMES = 10_000
 _SPEED = 5.0  # [m/s] ten keyframes a second
 _SIGMA = 0.02  # [m] of loops
 _LONGEST = 20.0  # [s] that a loop goes back

@@ -67,7 +67,9 @@ class Walk:
 
     def met(self, part: Part) -> list[bool]:
         """Return of each step whether its thread came there after the one before."""
-        calls, begin, met = self.calls[part.thread], 0, []
+        calls = self.calls[part.thread]
+        begin = 0
+        met = []
         for step in part.steps:
             wanted = step.file, step.call.split('.')[-1]
             found = wanted in calls[begin:]
@@ -92,7 +94,9 @@ class Peer:
     def __init__(self, executor: SingleThreadedExecutor):
         node = rclpy.create_node('peer')
         executor.add_node(node)
-        self._executor, self._sent, self.paths = executor, 0, list[PathMessage]()
+        self._executor = executor
+        self._sent = 0
+        self.paths = list[PathMessage]()
         node.create_subscription(PathMessage, 'path', self.paths.append, 10)
         self._odometry = node.create_publisher(Odometry, 'odom', QoSProfile(depth=1000))
         self._loops = node.create_publisher(PoseWithCovarianceStamped, 'loop_closures', 10)

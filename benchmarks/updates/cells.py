@@ -30,6 +30,7 @@ from robust.kinds import BICOCCA, CITY, INTEL, KINDS, LIES, MANHATTAN
 from robust.places import Place, error_by_time, place, place_of
 from robust.runs import within
 from updates.in_space import SPACES
+from updates.isam2 import isam2
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
@@ -41,7 +42,7 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.paper.updates import Drive, Kept, first_of, isam2, run_updates
+from l1slam_ros.paper.updates import Drive, Kept, first_of, run_updates
 
 CHECKPOINTS = 20
 # Simulated: keyframes and edges of the paper's Manhattan10k, and of a large sparse world.

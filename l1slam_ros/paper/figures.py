@@ -40,11 +40,9 @@ _START = ('Every stored pose moved at random, by the least of some standard devi
           'L2 does not recover. The seed, then Algorithm 4 as printed: L1 cost {cost}.')
 _UPDATES = ('A simulated world in the proportions of City10k (seed {seed}), {poses:,} keyframes, '
             'an update after each, at {rate:.0f} keyframes per second. Ours is L1 and doubts '
-            'every loop; *ISAM2* is gtsam: L2, every loop believed, linearised again above 0.1; '
-            '*batch L2* solves all that has come anew, from the map as it is, at some sizes. '
-            'Milliseconds of the processor; what our other threads took behind, {behind:.1f} s in '
-            'all, not among them.')
-_NO_PEER = 'Without ISAM2: gtsam is not installed (`pip install gtsam`).'
+            'every loop; *batch L2* solves all that has come anew, from the map as it is, at some '
+            'sizes. Milliseconds of the processor; what our other threads took behind, '
+            '{behind:.1f} s in all, not among them.')
 # Of so many updates one after the other the median and the 95th percentile are drawn.
 _WINDOWS = 40
 _LIES = ('False loops at random between far poses, as sure as true ones. *Off*: RMSE of the '
@@ -107,19 +105,15 @@ def figure_5(study: Study, folder: Path) -> list[str]:
         updates, batch = measure_growth(keyframes, rate, np.random.default_rng(WORLD_SEED),
                                         progress.advance)
     sizes = np.array([now.graph.n_poses for now in updates.on_the_way])
-    curves = [*_windows('ours', updates.ours), *_windows('ISAM2', updates.peer),
-              Curve('batch L2', sizes, 1e3 * batch)]
+    curves = [*_windows('ours', updates.ours), Curve('batch L2', sizes, 1e3 * batch)]
     plot_curves(folder / 'figure_5.png', curves, 'time per update', ('keyframes', 'ms'))
     said = _UPDATES.format(seed=WORLD_SEED, poses=keyframes, rate=keyframes / updates.elapsed,
                            behind=updates.behind)
-    return [said, *([] if updates.peer else ['', _NO_PEER]), '',
-            '![time per update over keyframes](figure_5.png)']
+    return [said, '', '![time per update over keyframes](figure_5.png)']
 
 
 def _windows(name: str, seconds: Sequence[float]) -> list[Curve]:
     """Return the median and the 95th percentile of updates one after the other."""
-    if not seconds:
-        return []
     parts = np.array_split(1e3 * np.array(seconds), min(_WINDOWS, len(seconds)))
     ends = np.cumsum([len(part) for part in parts])
     return [Curve(f'{name}, {word}', ends, np.array([np.percentile(part, q) for part in parts]))

@@ -9,20 +9,15 @@
 """
 What an update costs while the map grows: Figure 5, and what `benchmarks/incremental.py` measures.
 
-In: a graph, fed to the back end pose by pose, in turn with gtsam's ISAM2 where that is installed.
-Out: the seconds of each update, and the maps on the way. Seconds are of the thread's processor
-time: others on the machine do not lengthen them, and what goes on behind is counted by itself.
+In: a graph, fed to the back end pose by pose, in turn with a peer if there is one. Out: the
+seconds of each update, and the maps on the way. Seconds are of the thread's processor time: others
+on the machine do not lengthen them, and what goes on behind is counted by itself.
 """
 
-import importlib.util
-import multiprocessing
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from multiprocessing.connection import Connection
-from typing import Any
 
 import numpy as np
 
@@ -40,8 +35,6 @@ from l1slam_ros.io.compilation import load
 from l1slam_ros.io.files import invented_stamps
 from l1slam_ros.io.free_memory import give_back_freed_memory
 
-# [m or rad] ISAM2 linearises again what has moved by more, after each pose.
-_RELINEARISE = 0.1
 # [s] What is left to the workers after the last keyframe; the driver lags no more than this.
 IDLE, _LAG = 1.0, 0.1
 # As in City10k, the graph of the figure in the paper.
@@ -101,102 +94,6 @@ class Updates:
         they would be counted as the back end's memory.
         """
         return [self.at_rest.first(*mark) for mark in self.marks] if self.at_rest else []
-
-
-class _Isam2:
-    """
-    The peer: L2, every loop of the graph believed.
-
-    Parameters
-    ----------
-    graph : what it is fed with
-    patience : [s] of its updates in all; then it is left behind
-
-    """
-
-    def __init__(self, graph: FactorGraph, patience: float = float('inf')):
-        gtsam: Any = importlib.import_module('gtsam')
-        self._gtsam = gtsam
-        self._factors = graph.between
-        self._k = graph.manifold.TANGENT_SIZE
-        self._Pose, self._Between, self._Prior = (
-            (gtsam.Pose2, gtsam.BetweenFactorPose2, gtsam.PriorFactorPose2) if self._k == 3 else
-            (gtsam.Pose3, gtsam.BetweenFactorPose3, gtsam.PriorFactorPose3))
-        options = gtsam.ISAM2Params()
-        options.setRelinearizeThreshold(_RELINEARISE)
-        options.relinearizeSkip = 1
-        self._isam, self._at = gtsam.ISAM2(options), self._Pose()
-        ends = np.maximum(self._factors.i, self._factors.j)
-        self._rows = np.split(np.argsort(ends, kind='stable'),
-                              np.searchsorted(np.sort(ends), np.arange(1, graph.n_poses)))
-        self._odometry = self._factors.is_odometry
-        self._left = patience
-
-    def update(self, k: int) -> list[float]:
-        """Add keyframe k and its factors; return the seconds, [] once its time was up."""
-        if self._left <= 0:
-            return []
-        gtsam = self._gtsam
-        new = self._gtsam.NonlinearFactorGraph()
-        values = self._gtsam.Values()
-        step = self._Pose()
-        if k == 0:
-            new.add(self._Prior(0, step, gtsam.noiseModel.Constrained.All(self._k)))
-        for row in self._rows[k]:
-            i, j = int(self._factors.i[row]), int(self._factors.j[row])
-            Z = self._pose(self._factors.measurement[row])
-            # In space gtsam's rotations come first.
-            root = np.roll(self._factors.sqrt_information[row], self._k // 6 * 3, axis=1)
-            new.add(self._Between(i, j, Z, gtsam.noiseModel.Gaussian.SqrtInformation(root)))
-            if self._odometry[row]:
-                step = Z if j == k else Z.inverse()
-        values.insert(k, self._at.compose(step))
-        began = time.thread_time()
-        self._isam.update(new, values)
-        estimate = (self._isam.calculateEstimatePose2 if self._k == 3 else
-                    self._isam.calculateEstimatePose3)
-        self._at = estimate(k)
-        seconds = time.thread_time() - began
-        self._left -= seconds
-        return [seconds]
-
-    def _pose(self, pose: Array) -> Any:
-        if self._k == 3:
-            return self._Pose(*pose)
-        x, y, z, w = pose[3:]
-        return self._Pose(self._gtsam.Rot3.Quaternion(w, x, y, z), pose[:3])
-
-
-@contextmanager
-def isam2(graph_of: Callable[[], FactorGraph], patience: float = float('inf')) -> Iterator[Peer]:
-    """
-    Give ISAM2 in a process of its own, as two back ends would run.
-
-    In this one it would hold the interpreter's lock for all of an update, so that our threads
-    stood still meanwhile, and its memory would count as ours. graph_of : called there.
-    """
-    context = multiprocessing.get_context('fork')
-    here, there = context.Pipe()
-    process = context.Process(target=_serve, args=(there, graph_of, patience), daemon=True)
-    process.start()
-    there.close()
-
-    def update(k: int) -> list[float]:
-        here.send(k)
-        seconds: list[float] = here.recv()
-        return seconds
-
-    here.recv()
-    yield update
-    here.send(None)
-    process.join()
-
-
-def _serve(asked: Connection, graph_of: Callable[[], FactorGraph], patience: float) -> None:
-    peer = _Isam2(graph_of(), patience)
-    asked.send('ready')
-    for k in iter(asked.recv, None):
-        asked.send(peer.update(k))
 
 
 def first_of(graph: FactorGraph, poses: int, rows: Indices) -> FactorGraph:
@@ -284,8 +181,7 @@ def measure_growth(keyframes: int, rate: float, rng: np.random.Generator,
     give_back_freed_memory()
     run_updates(Drive.of(_world(_WARM_UP, rng)), None, np.inf, 1)
     graph = _world(keyframes, rng)
-    with isam2(lambda: graph) if importlib.util.find_spec('gtsam') else nullcontext() as peer:
-        updates = run_updates(Drive.of(graph), peer, rate, _BATCHES, advance=advance)
+    updates = run_updates(Drive.of(graph), None, rate, _BATCHES, advance=advance)
     return updates, np.array([_batch_seconds(now) for now in updates.on_the_way])
 
 

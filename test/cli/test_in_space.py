@@ -69,7 +69,9 @@ def test_information_that_is_not_definite_costs_one_line_and_no_map(capsys, buil
     """A third of the edges say of one direction that they know less than nothing of it."""
     truth = ('--reference', f'{building}.truth.txt', '--rotation-information', reading)
     clean = solve_json(capsys, building, *truth)
-    lines, upper, count = building.read_text().splitlines(), np.triu_indices(6), 0
+    lines = building.read_text().splitlines()
+    upper = np.triu_indices(6)
+    count = 0
     for k, line in enumerate(lines):
         words = line.split()
         if words[0] == 'EDGE_SE3:QUAT' and k % 3 == 0:

@@ -98,7 +98,9 @@ def test_a_recording_stays_as_it_is(capsys, recording, users):
 
 
 def test_a_graph_of_a_user_stays_as_it_is(capsys, users, tmp_path, lies):
-    copy, hard, before = tmp_path / 'copy.g2o', tmp_path / 'hard.g2o', users.read_bytes()
+    copy = tmp_path / 'copy.g2o'
+    hard = tmp_path / 'hard.g2o'
+    before = users.read_bytes()
     os.link(users, hard)
     for force in (), ('--force',):
         for output in users, hard:

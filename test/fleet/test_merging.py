@@ -41,7 +41,9 @@ def cut(world, folder, ids=lambda k: k % HALF, write=lambda k: f'{k // HALF + 1}
             k = int(rest[0])
             lines[k // HALF].append(f'{tag} {ids(k)} {" ".join(rest[1:])}')
         elif tag.startswith('EDGE'):
-            i, j, values = int(rest[0]), int(rest[1]), ' '.join(rest[2:])
+            i = int(rest[0])
+            j = int(rest[1])
+            values = ' '.join(rest[2:])
             if i // HALF == j // HALF:
                 lines[i // HALF].append(f'{tag} {ids(i)} {ids(j)} {values}')
             elif (i, j) != (HALF - 1, HALF):

@@ -79,7 +79,9 @@ def test_the_summary_of_a_perfect_map_is_an_error_of_zero(tmp_path):
         PoseStamped(header=header('map', int(stamp)), pose=Pose(position=Point(x=x, y=y)))
         for stamp, (x, y) in zip(recording.stamps, turned, strict=True)])
     grid = OccupancyGrid(data=[-1, 0, 100, 0, 0, 100])
-    grid.info.resolution, grid.info.width, grid.info.height = 2.0, 3, 2
+    grid.info.resolution = 2.0
+    grid.info.width = 3
+    grid.info.height = 2
     states = {**states_of(recording), (1, 2): 'accepted', (1, 3): 'suspect'}
     heard = Heard(serialize_message(path), grid, 1000, states)
     for is_false in True, False:  # one of each is told apart wrongly

@@ -39,7 +39,9 @@ class Fault:
     """Stands before a function of a module: while it is on, calls end in a fault."""
 
     def __init__(self, monkeypatch, module, name, kind):
-        self.on, self.calls, self.original = False, 0, getattr(module, name)
+        self.on = False
+        self.calls = 0
+        self.original = getattr(module, name)
         self.kind = kind
         monkeypatch.setattr(module, name, self)
 

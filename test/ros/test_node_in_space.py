@@ -22,7 +22,9 @@ from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.ros.shell.header import header
 
-NS, KEYFRAMES, LOOPS = 10**9, 60, 20
+NS = 10**9
+KEYFRAMES = 60
+LOOPS = 20
 PLANAR = np.diag([0.0025, 0.0025, 0, 0, 0, 1e-4])
 
 

@@ -60,7 +60,9 @@ def said(capfd):
 
 
 def test_a_map_over_a_restart_is_whole_and_the_restart_is_told_of(bench, capfd):
-    laps, b, sent = Laps(seed=4, laps=2.5), bench(), 0
+    laps = Laps(seed=4, laps=2.5)
+    b = bench()
+    sent = 0
     begin, silence = LAP + 14.4, 2.0
     for found in laps.heard(laps.restarted(begin, silence, (0.02, 0.0, 0.0))):
         is_loop = isinstance(found, LoopClosure)

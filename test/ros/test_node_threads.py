@@ -148,7 +148,9 @@ def test_the_path_does_not_wait_for_the_work_behind_an_update(bench, monkeypatch
 
 def test_updates_do_not_wait_for_the_path_of_a_large_map(bench, monkeypatch):
     monkeypatch.setattr(publishing, '_LARGE', 2)
-    b, goes_on, made = bench(), threading.Event(), publishing.path_bytes
+    b = bench()
+    goes_on = threading.Event()
+    made = publishing.path_bytes
     b.drive(0, 4)
     b.until(lambda: len(b.path().poses) == 4, 'a map, by the thread of a large one')
     monkeypatch.setattr(
@@ -195,7 +197,9 @@ def test_what_works_behind_makes_way_for_messages(bench):
 
 def test_messages_of_all_topics_are_used_in_the_order_they_came(bench, monkeypatch):
     b = bench()
-    go_on, used, backend = threading.Event(), [], b.backend._backend
+    go_on = threading.Event()
+    used = []
+    backend = b.backend._backend
     monkeypatch.setattr(backend, 'add_odometry', lambda s, _: used.append(
         s.stamp) or go_on.wait())
     monkeypatch.setattr(backend, 'add_loop', lambda one: used.append(one.stamp))

@@ -43,7 +43,10 @@ PATTERNS = {
 @pytest.mark.parametrize('name', PATTERNS)
 def test_what_is_out_reaches_to_the_next_message(name, rng):
     stamps = 10**18 + np.cumsum(1e9 * PATTERNS[name](rng)).astype(np.int64)
-    horizon, out, late, ahead = Horizon(), 0, 0, []
+    horizon = Horizon()
+    out = 0
+    late = 0
+    ahead = []
     for k, stamp in enumerate(stamps.tolist()):
         late += k > 0 and stamp > out
         horizon.note(stamp)

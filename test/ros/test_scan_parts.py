@@ -121,7 +121,9 @@ def test_time_goes_back_when_two_stamps_say_so():
 
 def steps(rng, count=40):
     """Yield stamps and what a front end says of a robot that goes along, a metre in ten scans."""
-    options, keyframe, pose = ScanKeyframes(), np.zeros(3), np.zeros(3)
+    options = ScanKeyframes()
+    keyframe = np.zeros(3)
+    pose = np.zeros(3)
     for k in range(count):
         pose = se2.compose(pose[None], np.array([[0.1, 0.0, 0.02]]))[0] if k else pose
         moved = se2.between(keyframe[None], pose[None])[0]
@@ -136,7 +138,9 @@ def steps(rng, count=40):
 def test_the_back_end_has_the_keyframes_of_the_scans_and_what_they_know(rng):
     shipped = read_params_file_of('backend')
     backend = Backend(BackendOptions.from_mapping(shipped), 2)
-    told, keyframes, stated = IncrementalOdometry(ScanKeyframes()), [], []
+    told = IncrementalOdometry(ScanKeyframes())
+    keyframes = []
+    stated = []
     for stamp, step in steps(rng):
         pose, covariance = told.tell(stamp, step, begins=False)
         assert np.linalg.eigvalsh(covariance).min() > 0

@@ -161,7 +161,9 @@ def test_a_keyframe_that_no_factor_kept_is_as_if_it_had_not_been_named(k, shape,
     whole, border = Whole(system, weights, k), BorderedSystem(cholesky, OLD, k)
 
     def add(ends):
-        blocks, noise, residual = block(k, rng), rng.uniform(0.5, 2, k), rng.standard_normal(k)
+        blocks = block(k, rng)
+        noise = rng.uniform(0.5, 2, k)
+        residual = rng.standard_normal(k)
         predicted = border.predict(ends, blocks, residual)
         assert_allclose(predicted.covariance, whole.covariance(ends, blocks, OLD), rtol=1e-7,
                         atol=1e-9)

@@ -31,7 +31,9 @@ from l1slam_ros.core.running.snapshot import ACCEPTED, SavedMap
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
-N, KNOWN, LAST = 180, 140, 150
+N = 180
+KNOWN = 140
+LAST = 150
 SURE = covariance6(1e-4 * np.eye(3))
 
 

@@ -10,7 +10,9 @@ import numpy as np
 
 from l1slam_ros.core.graph.draws import keys, signs
 
-N, K, Q = 4000, 3, 24
+N = 4000
+K = 3
+Q = 24
 ONE = np.arange(N)
 
 

@@ -193,7 +193,9 @@ def test_a_factor_that_is_turned_says_the_same_to_first_order(rng, manifold):
 
 def two_robots(rng):
     """Return a graph of two robots whose keyframes come in turns, and poses it measures."""
-    graph, truth, root = FactorGraph(se2), random_poses(6, rng), 2 * np.eye(3)[None]
+    graph = FactorGraph(se2)
+    truth = random_poses(6, rng)
+    root = 2 * np.eye(3)[None]
     for robot in 0, 1:
         graph.add_poses(1, robot, begins_part=True)
     for k, robot in (2, 0), (3, 1), (4, 1), (5, 0):

@@ -311,7 +311,9 @@ def test_loops_that_wait_or_expired_cost_nothing():
 def test_the_covariance_is_carried_to_the_keyframe(rng):
     """Against differences: how the factor moves when the measured pose does."""
     poses, covariance = curve(200), 1e-4 * random_information(1, rng)[0]
-    reference, sample, h = 7, 151, 1e-6
+    reference = 7
+    sample = 151
+    h = 1e-6
 
     def measured(step):
         builder = grown(poses, DEFAULTS)

@@ -260,7 +260,9 @@ def test_whatever_comes_each_sample_is_used_held_or_counted(seed):
     options = GraphBuilderOptions(EVERY.keyframe, OdometryOptions(source))
     builder, old = GraphBuilder(se2, options), 0
     for k in range(200):
-        time, pose, kind = 100.0 + k * PERIOD, (0.1 * k, 0.0, 0.0), rng.random()
+        time = 100.0 + k * PERIOD
+        pose = (0.1 * k, 0.0, 0.0)
+        kind = rng.random()
         if kind < 0.1:
             time += rng.choice((-1.0, 1.0)) * 10 ** rng.uniform(-1, 0)
         elif kind < 0.15:

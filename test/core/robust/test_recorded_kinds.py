@@ -93,7 +93,9 @@ def test_a_dozen_loops_do_not_teach_that_noise_is_a_thousand_times_what_is_state
 @pytest.mark.parametrize('joined', [True, False])
 def test_two_sessions_are_joined_by_loops_or_stay_two_parts(world, joined):
     bad = spoilt(world, 'random', 170)
-    factors, seam, n = bad.graph.between, 199, 400
+    factors = bad.graph.between
+    seam = 199
+    n = 400
     low, high = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
     across = (low <= seam) & (high > seam)
     keep = ~across if not joined else ~(across & (high - low == 1))
@@ -145,7 +147,9 @@ def test_one_place_that_carries_all_is_doubtful_where_odometry_hardly_bears_it_o
 def test_a_slip_that_one_place_alone_tells_of_is_doubtful(turn, doubted):
     """The second lap's loops are refused then; those of the first half do not span the step."""
     lap, _ = ring(0)
-    near, true, factors = np.arange(0, 240, 6), odometry_poses(lap), lap.between
+    near = np.arange(0, 240, 6)
+    true = odometry_poses(lap)
+    factors = lap.between
     Z = factors.measurement.copy()
     Z[factors.is_odometry & (factors.i == 400), 2] += turn
     graph = retold(lap, Z)

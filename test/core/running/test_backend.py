@@ -210,7 +210,9 @@ def test_small_budgets_judge_to_the_end(world):
 
 def test_a_judgement_that_ends_within_an_update_is_followed_up(world, monkeypatch):
     """It ends after the update has read the state, and before it has asked who is at work."""
-    begin, made, at_rest = Worker.start, threading.Event(), threading.Event()
+    begin = Worker.start
+    made = threading.Event()
+    at_rest = threading.Event()
 
     def start(worker, task):
         if task.args[1] in (Work.ROUND, Work.EXACT):

@@ -91,7 +91,9 @@ def test_work_behind_makes_way_for_updates(monkeypatch):
 
 
 def test_nobody_sees_a_keyframe_without_its_odometry(monkeypatch):
-    backend, meeting, add_poses = Backend(EVERY), Meeting(), FactorGraph.add_poses
+    backend = Backend(EVERY)
+    meeting = Meeting()
+    add_poses = FactorGraph.add_poses
     drive(backend, 0, 1)
 
     def slowly(graph, *given, **how):
@@ -225,7 +227,9 @@ def patient(problem, options, budget, check, exact):
 
 @pytest.mark.parametrize('interrupt', ['reset', 'restore', 'settle', 'stopped'])
 def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
-    backend, stopped, begun = Backend(EVERY), threading.Event(), threading.Event()
+    backend = Backend(EVERY)
+    stopped = threading.Event()
+    begun = threading.Event()
     drive(backend, 0, 5)
     now = backend.saved()
 
@@ -300,7 +304,10 @@ def test_a_map_of_nothing_is_not_asked_whether_it_hangs_on_its_norm(monkeypatch)
 
 
 def test_a_settle_lets_a_fork_through_and_comes_to_its_end(monkeypatch):
-    backend, begun, solve, calls = Backend(EVERY), threading.Event(), updates.optimise, []
+    backend = Backend(EVERY)
+    begun = threading.Event()
+    solve = updates.optimise
+    calls = []
     drive(backend, 0, 5)
 
     def slowly(problem, options, check):

@@ -33,7 +33,9 @@ class Restarts:
     """
 
     def __init__(self, at, back=False, **of_team):
-        self.team, self.at, self.back = Team(robots=3, **of_team), at, back
+        self.team = Team(robots=3, **of_team)
+        self.at = at
+        self.back = back
         manifold = self.manifold = self.team.manifold
         far = np.linspace(0.3, 0.1, manifold.TANGENT_SIZE)
         far[:2] = 300.0, 200.0
@@ -112,7 +114,9 @@ def test_three_robots_that_restart_have_the_loops_of_the_batch(world, most):
 def test_a_new_part_stands_where_its_robot_was_and_goes_with_it(joined_first):
     """Keyframes of others come between; what joins one part moves both."""
     drive = Restarts(37, n=240, edges=840, lies=0)
-    backend, at, joins = Backend(EVERY), 37, ([], [])
+    backend = Backend(EVERY)
+    at = 37
+    joins = ([], [])
 
     def guess():
         """Return the step from the end of the one part to the begin of the other."""

@@ -68,7 +68,9 @@ def test_every_norm_has_its_solver():
 
 @pytest.mark.parametrize('steps', [0, 1, 3, MOST])
 def test_it_says_how_far_it_came_and_never_ends_worse(name, steps, world):
-    graph, start, reports = world[0], odometry_poses(world[0]), []
+    graph = world[0]
+    start = odometry_poses(world[0])
+    reports = []
     given = start.copy()
     given.flags.writeable = False
     found = solve(name, graph, given, steps, lambda k, cost: reports.append((k, cost)))

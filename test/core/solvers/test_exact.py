@@ -98,7 +98,9 @@ def stiff_part_on_soft_ties(rng):
 
 def test_long_straight_ways_with_few_loops_are_solved_to_their_end():
     """600 m that bend as a whole: of ten, steps of each pose by itself solve seven."""
-    n, loops, sigma = 600, 9, np.array([0.05, 0.05, 0.01])
+    n = 600
+    loops = 9
+    sigma = np.array([0.05, 0.05, 0.01])
     solved = 0
     for seed in range(10):
         rng = np.random.default_rng(seed)

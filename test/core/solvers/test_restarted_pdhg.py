@@ -97,7 +97,9 @@ def test_the_kernel_takes_the_steps_of_the_page(k, dtype, within, rng):
     """One and some at a time; tiles are packed in single precision, so A itself is rounded."""
     system, _ = scaled_system(chain_with_loops(k, rng))
     y0 = rng.uniform(-1, 1, len(system.b))
-    y, weight, K = y0.copy(), 0.7, (0,) * k
+    y = y0.copy()
+    weight = 0.7
+    K = (0,) * k
     layout, packed, flat = laid_out(system, y, y0, dtype)
     x, z, g = np.zeros((3, system.size + 1, k), dtype)
     g[:-1] = (system.A.T @ y).reshape(-1, k)
@@ -118,7 +120,10 @@ def test_the_kernel_takes_the_steps_of_the_page(k, dtype, within, rng):
 @pytest.mark.parametrize('k', BLOCK_SIZES)
 def test_a_look_finds_the_next_point_and_its_residual(k, rng):
     system, _ = scaled_system(chain_with_loops(k, rng))
-    A, b, weight, K = system.A, system.b, 0.4, (0,) * k
+    A = system.A
+    b = system.b
+    weight = 0.4
+    K = (0,) * k
     y = rng.uniform(-1, 1, len(b))
     layout, _, flat = laid_out(system, y, y, np.float32)
     x, g, x_bar, g_bar = np.zeros((4, system.size + 1, k), np.float32)

@@ -37,7 +37,9 @@ class Robot:
     def __init__(self, path, period=1e-9):
         self.options = NodeOptions(save_path=str(path), autosave_period=period,
                                    on_time_jump='reset')
-        self.backend, self.warnings, self.seconds = Backend(self.options), [], 0
+        self.backend = Backend(self.options)
+        self.warnings = []
+        self.seconds = 0
         self.map_file = MapFile(self.backend, lambda: self.options, self.warnings.append)
 
     def drive(self, count):

@@ -305,7 +305,9 @@ def test_a_disk_that_fails_at_any_call_leaves_the_old_map_or_the_new_one(
 
 @pytest.mark.parametrize('early', [True, False])
 def test_a_power_cut_leaves_a_map_at_any_moment(two, halfway, monkeypatch, early):
-    before, found, kept = two.with_name('map.g2o.1'), [], []
+    before = two.with_name('map.g2o.1')
+    found = []
+    kept = []
     old = two.read_bytes(), before.read_bytes()
 
     def look():
@@ -348,7 +350,9 @@ def test_what_killed_writers_left_is_removed(two, halfway):
 
 
 def test_to_others_it_is_a_graph_with_comments(halfway, tmp_path):
-    saved, path, plain = halfway.saved(), tmp_path / 'map.g2o', tmp_path / 'plain.g2o'
+    saved = halfway.saved()
+    path = tmp_path / 'map.g2o'
+    plain = tmp_path / 'plain.g2o'
     save_map(path, saved)
     graph, judgement = saved.builder.graph, saved.judgement
     write_graph_file(plain, GraphRecord(graph, saved.optimised.poses, np.arange(50)))

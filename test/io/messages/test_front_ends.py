@@ -166,7 +166,10 @@ def same_factors(found, expected):
     def rows(graph):
         f = graph.between
         return np.lexsort((f.j, f.i, ~f.is_odometry))
-    f, e, a, b = found.between, expected.between, rows(found), rows(expected)
+    f = found.between
+    e = expected.between
+    a = rows(found)
+    b = rows(expected)
     assert f.pairs[a].tolist() == e.pairs[b].tolist()
     assert f.is_odometry[a].tolist() == e.is_odometry[b].tolist()
     assert np.allclose(f.measurement[a], e.measurement[b], atol=1e-12)

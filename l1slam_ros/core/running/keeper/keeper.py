@@ -47,7 +47,7 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
 # Number of factors that a front takes while its lock is held and before the clock is read; one if
 # the front has so many rows that a loop takes milliseconds.
-_AT_ONCE, _LONG = 4, MOST_ROWS // 2
+_AT_ONCE, _LONG = 4, MOST_ROWS // 4
 
 
 class Revisions(NamedTuple):

@@ -18,8 +18,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from l1slam_ros.core.bordered.front import Look
+from l1slam_ros.core.bordered.front import Front, Look
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.improve import Check, front_of, improve, one_round
@@ -33,8 +34,8 @@ from l1slam_ros.core.running.snapshot import Snapshot
 # longer by the clock.
 _LEAST_ROUND = 0.1
 _PATIENCE = 4
-# Passes in which a new front takes what came meanwhile, before it is adopted; factors of each.
-_PASSES, _AT_ONCE = 3, 16
+# Factors that a new front takes before it looks whether to stop.
+_AT_ONCE = 16
 
 
 def carry_out(keeper: Keeper, piece: Work, moment: Moment, check: Check) -> None:
@@ -66,16 +67,32 @@ def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
     improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check, exact)
     check()
     front = front_of(problem, improvement.poses, looked, check)
-    looks = list[Look]()
-    for _ in range(_PASSES):
-        state, factors, _ = keeper.look()
-        what = state.table.for_new_front(
-            factors, whole.judgement.accepted, pending is not None)
-        while front is not None and not front.closed and front.rows < len(what):
-            check()
-            looks += front.take(factors, what[front.rows:front.rows + _AT_ONCE])
+    looks = [] if front is None else _caught_up(
+        keeper, front, whole.judgement.accepted, pending is not None, check)
     check()
     keeper.adopt(improvement.of_all(whole), front, pending, looks)
+
+
+def _caught_up(keeper: Keeper, front: Front, part: Mask, again: bool, check: Check) -> list[Look]:
+    """
+    Let a new front take what came while it was made; return what it says of that.
+
+    What came during one pass is left to the next one, as long as that is less than it was: what is
+    left at the end is left to an update, for which a caller waits. part, again : see
+    `FactorTable.for_new_front`
+    """
+    looks = list[Look]()
+    left = np.inf
+    while not front.closed:
+        state, factors, _ = keeper.look()
+        what = state.table.for_new_front(factors, part, again)
+        before, left = left, len(what) - front.rows
+        if not 0 < left < before:
+            break
+        while not front.closed and front.rows < len(what):
+            check()
+            looks += front.take(factors, what[front.rows:front.rows + _AT_ONCE])
+    return looks
 
 
 def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
