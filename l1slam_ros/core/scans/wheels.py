@@ -24,6 +24,20 @@ from l1slam_ros.core.scans.points import Scan
 _FAR = 1.0
 _FAST = 3.0
 _TIMES = 5.0
+# Wheels: part of the way and of the turn, turn for each metre, and of each scan [m, rad].
+_WAY = 0.3
+_TURN = 0.2
+_TURN_OF_WAY = 0.3
+_STEP = 0.01
+_STEP_TURN = 0.01
+# [m] So far from where it is said to be a laser may sit: what it moves when the robot turns.
+_ASIDE = 0.1
+# A scale is learnt from so many steps. That it is 1 counts as so much way [m], squared: four steps
+# of half a metre, for a step's slip has twice the deviation of what wheels are off for good.
+_STEPS = 100
+_AS_SAID = 4 * 0.5**2
+# A step is taken to be off by such a part at most.
+_SLIP = 0.15
 
 
 class Wheels:
@@ -72,3 +86,43 @@ def _is_jump(moved: Array, velocity: Array, seconds: float) -> bool:
     """Return whether a robot cannot have moved so, (3,), that had such a velocity (3,) before."""
     usual = seconds * float(np.hypot(*velocity[:2]))
     return bool(np.hypot(*moved[:2]) > max(_FAR, _FAST * seconds, _TIMES * usual))
+
+
+class WheelScale:
+    """
+    Learns how far the robot goes for each metre that the wheels count.
+
+    A scale that is wrong is an error that adds up, wherever scans do not show how far it goes: of
+    wheels worn or configured by some percent, it is most of their error. It is found by least
+    squares over the last `_STEPS` steps that scans measured, and a few that say 1.
+
+    Source: recursive least squares with exponential forgetting; Ljung, "System Identification",
+    1999, section 11.2.
+    """
+
+    def __init__(self) -> None:
+        self._scale = 1.0
+        self._weight = _AS_SAID
+
+    def corrected(self, motion: Array) -> Array:
+        """Return a motion (3,) of the wheels with its way to scale."""
+        return motion * (self._scale, self._scale, 1.0)
+
+    def learn(self, told: Array, moved: Array) -> None:
+        """Learn of a step that the wheels, to scale, told, (3,), and how far scans measured it."""
+        square = float(told[0] ** 2 + told[1] ** 2)
+        if square == 0.0:
+            return
+        # What the wheels counted was less by the scale.
+        off = float(np.clip((moved[:2] @ told[:2]) / square - 1.0, -_SLIP, _SLIP)) * self._scale
+        self._weight = (1.0 - 1.0 / _STEPS) * self._weight + square
+        self._scale += off * square / self._weight
+
+
+def wheel_covariance(motion: Array) -> Array:
+    """Return the covariance of a motion (3,) of the wheels, (3, 3) in the axes of its end."""
+    way = float(np.hypot(motion[0], motion[1]))
+    turn = abs(float(motion[2]))
+    along = (_WAY * way) ** 2 + (_ASIDE * turn) ** 2 + _STEP**2
+    heading = (_TURN * turn) ** 2 + (_TURN_OF_WAY * way) ** 2 + _STEP_TURN**2
+    return np.diag((along, along, heading))
