@@ -188,7 +188,7 @@ VARIANTS: dict[str, Callable[[TrueLog, np.random.Generator], TrueLog]] = {
     '5 cm of noise': _of_ranges(_noisy),
     'a tenth of the rays random': _of_ranges(_random_rays),
     'a fifth of the rays through glass': _of_ranges(_glass),
-    'a laser that hangs, and nobody says so': _hanging,
+    'a laser that hangs unsaid': _hanging,
     'backwards in time': _backwards,
     'mirrored': _mirrored,
     'worse wheels': _worse_wheels,

@@ -32,7 +32,7 @@ from l1slam_ros.core.scans.matching import Match, match
 from l1slam_ros.core.scans.points import Points, rotated, transformed
 from l1slam_ros.core.scans.search import search
 from l1slam_ros.core.scans.submaps import Keyframe, Submap, seen_by, submap_of, submap_of_scan
-from l1slam_ros.core.scans.wheels import WheelScale, wheel_covariance
+from l1slam_ros.core.scans.wheels import Calibration, wheel_covariance
 
 # So many keyframes are the map that scans are matched with.
 _MAP = 4
@@ -64,7 +64,7 @@ _LOST_WAY = 1.0
 # motion: where a driver loses the sign of wheels that turn backwards, it does for a while.
 _DISTRUST = 25
 _WRONG = 2.0
-# Of the wheels' variance along a motion scans left so much less: they measured how far it went.
+# Of the wheels' variance scans left so much less: they measured the motion.
 _SURE = 10.0
 # [m] Wheels that are 5% wrong make a right map a wrong one over so long a way.
 _LONG = 5.0
@@ -133,7 +133,7 @@ class ScanOdometry:
         self._distrusted = 0
         # Where a scan was matched last, and the wheels' way and turns since.
         self._known, self._blind = np.zeros(3), np.zeros(2)
-        self._scale = WheelScale()
+        self._calibration = Calibration()
         # How far it went since scans showed how far [m].
         self._by_wheels = 0.0
 
@@ -142,7 +142,7 @@ class ScanOdometry:
         if self._wheels is None or self._field is None:
             self._wheels = wheels
             return self._begin(stamp, points)
-        motion = self._scale.corrected(se2.between(self._wheels[None], wheels[None])[0])
+        motion = self._calibration.follow(se2.between(self._wheels[None], wheels[None])[0])
         self._wheels = wheels
         expected = se2.compose(self._pose[None], motion[None])[0]
         self._told = se2.compose(self._told[None], motion[None])[0]
@@ -169,7 +169,7 @@ class ScanOdometry:
     def end_drive(self) -> None:
         """Let the next scan be the first of another drive: a part of its own."""
         self._wheels = None
-        self._scale = WheelScale()
+        self._calibration = Calibration()
         self._unmatched = 0
         self._distrusted = 0
         self._blind = np.zeros(2)
@@ -299,7 +299,8 @@ class ScanOdometry:
         if self._unmatched or done < 1.0:
             return Step(self._pose, None, covariance, said)
         keyframe = Keyframe(stamp, self._pose, points, last.part, last.travelled + way)
-        said = '; '.join(filter(None, (said, self._said_of_length(moved, way))))
+        said = '; '.join(filter(None, (
+            said, self._calibration.said_of_turn(moved), self._said_of_length(moved, way))))
         self._keep(keyframe)
         return Step(self._pose, keyframe, covariance, said)
 
@@ -316,9 +317,10 @@ class ScanOdometry:
         allowed = along @ self._untold[:2, :2] @ along
         before = self._by_wheels
         self._by_wheels = before + way if 2 * known > allowed else 0.0
-        if _SURE * known < allowed and not self._distrusted:
+        if not self._distrusted:
             told = se2.between(self.keyframes[-1].pose[None], self._told[None])[0]
-            self._scale.learn(told, moved)
+            self._calibration.learn(told, moved, (
+                _SURE * known < allowed, _SURE * self._covariance[2, 2] < self._untold[2, 2]))
         return _BY_WHEELS if before < _LONG <= self._by_wheels else ''
 
     def _begin(self, stamp: int, points: Points, said: str = '') -> Step:
@@ -336,6 +338,7 @@ class ScanOdometry:
     def _keep(self, keyframe: Keyframe) -> None:
         """Take a keyframe into the map that scans are matched with."""
         self.keyframes.append(keyframe)
+        self._calibration.begin_step()
         local = submap_of(self.keyframes, len(self.keyframes) - 1, before=_MAP - 1, after=0)
         self._map = local
         # In the frame of the odometry, where poses are.

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Wheels that count too much, or too little, are corrected by what scans measured."""
+"""Wheels that count or turn too much, or too little, are corrected by what scans measured."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from rooms import along, box, drive
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.scans.odometry import ScanOdometry
 from l1slam_ros.core.scans.points import Mount, points_of
-from l1slam_ros.core.scans.wheels import WheelScale
+from l1slam_ros.core.scans.wheels import Calibration
 
 # A corridor with door frames every 3 m as far as 20 m, and bare beyond.
 WALLS = np.concatenate([box(0, 0, 80, 2)] + [
@@ -23,22 +23,29 @@ WALLS = np.concatenate([box(0, 0, 80, 2)] + [
 
 
 @pytest.mark.parametrize('scale', [0.9, 1.0, 1.04])
-def test_a_scale_is_learnt_forwards_and_backwards(rng, scale):
-    learning = WheelScale()
+def test_scale_and_drift_are_learnt_forwards_and_backwards(rng, scale):
+    learning = Calibration()
     for k in range(200):
         moved = np.array([0.5 * (-1) ** k, 0, 0.02])
-        counted = moved / scale * (1 + 0.05 * rng.standard_normal(), 1, 1)
-        learning.learn(learning.corrected(counted), moved)
+        drift = np.array([0, 0, 0.05 * moved[0] / scale + 0.01 * rng.standard_normal()])
+        counted = moved / (scale, scale, 1) * (1 + 0.05 * rng.standard_normal(), 1, 1) - drift
+        learning.learn(learning.corrected(counted), moved, (True, True))
     step = learning.corrected(np.array([1.0, 0.5, 0.3]))
-    np.testing.assert_allclose(step, (scale, 0.5 * scale, 0.3), atol=0.02)
+    np.testing.assert_allclose(step, (scale, 0.5 * scale, 0.35), atol=0.02)
 
 
-def test_wheels_that_stand_teach_nothing_and_a_slip_little():
-    learning = WheelScale()
-    learning.learn(np.zeros(3), np.array([0.5, 0, 0]))
-    assert learning.corrected(np.ones(3))[0] == 1
-    learning.learn(np.array([0.5, 0, 0]), np.array([0.1, 0, 0]))
-    assert 0.95 < learning.corrected(np.ones(3))[0] < 1
+def test_wheels_that_stand_teach_nothing_nor_what_scans_did_not_measure():
+    learning = Calibration()
+    learning.learn(np.zeros(3), np.array([0.5, 0, 0]), (True, True))
+    learning.learn(np.array([0.5, 0, 0]), np.array([0.6, 0, 0.1]), (False, False))
+    np.testing.assert_array_equal(learning.corrected(np.ones(3)), np.ones(3))
+
+
+def test_a_slip_teaches_little():
+    learning = Calibration()
+    learning.learn(np.array([0.5, 0, 0]), np.array([0.1, 0, 1.0]), (True, True))
+    assert 0.9 < learning.corrected(np.ones(3))[0] < 1
+    assert 1 < learning.corrected(np.ones(3))[2] < 1.1
 
 
 @pytest.mark.parametrize('wrong', [0.95, 1.05])
