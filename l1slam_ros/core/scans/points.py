@@ -152,7 +152,7 @@ def _lone(xy: Array, reach: Array) -> Mask:
     alone = np.full((2, len(xy)), True)
     alone[0, 1:] = way > 0.5 * reach[1:]
     alone[1, :-1] = way > 0.5 * reach[:-1]
-    return alone.all(axis=0)
+    return alone[0] & alone[1]
 
 
 def _at_stamp(xy: Array, velocity: Array, seconds: Array) -> Array:
