@@ -120,7 +120,11 @@ def _carried(given: TrueLog, _: np.random.Generator) -> TrueLog:
 
     Where the robot is in the next 10 s is not asked: by then it is noticed.
     """
-    first, last = len(given.log.scans) // 3, len(given.log.scans) // 2
+    return _without(given, len(given.log.scans) // 3, len(given.log.scans) // 2)
+
+
+def _without(given: TrueLog, first: int, last: int) -> TrueLog:
+    """Leave out scans, and the way between them; see `_carried`."""
     steps = given.steps
     steps[first - 1 : last] = 0.0
     rows = np.r_[0:first, last : len(given.log.scans)]
@@ -128,6 +132,15 @@ def _carried(given: TrueLog, _: np.random.Generator) -> TrueLog:
         given.stamps < given.times[last] + 10 * _SECOND)
     return replace(given.driven(steps).kept(rows), stamps=given.stamps[~cut],
                    truth=given.truth[~cut])
+
+
+def _carried_for(seconds: int) -> Callable[[TrueLog, np.random.Generator], TrueLog]:
+    """Leave out some seconds after a third of the log, which the wheels do not count."""
+    def carried(given: TrueLog, _: np.random.Generator) -> TrueLog:
+        first = len(given.log.scans) // 3
+        last = int(np.searchsorted(given.times, given.times[first - 1] + seconds * _SECOND))
+        return _without(given, first, last)
+    return carried
 
 
 def _with_gaps(seconds: int) -> Callable[[TrueLog, np.random.Generator], TrueLog]:
@@ -152,6 +165,15 @@ def _random_rays(ranges: Array, rng: np.random.Generator) -> Array:
     return np.where(rng.random(len(ranges)) < 0.1, anywhere, ranges)
 
 
+def _glass(ranges: Array, rng: np.random.Generator) -> Array:
+    return np.where(rng.random(len(ranges)) < 0.2, ranges + 6 * rng.random(len(ranges)), ranges)
+
+
+def _hanging(given: TrueLog, _: np.random.Generator) -> TrueLog:
+    """Let the laser hang upside down, which nobody says."""
+    return given.changed(lambda scan: replace(scan, ranges=scan.ranges[::-1].copy()))
+
+
 VARIANTS: dict[str, Callable[[TrueLog, np.random.Generator], TrueLog]] = {
     'as recorded': lambda given, _: given,
     'every fourth scan': lambda given, _: given.kept(np.arange(0, len(given.log.scans), 4)),
@@ -165,10 +187,13 @@ VARIANTS: dict[str, Callable[[TrueLog, np.random.Generator], TrueLog]] = {
     'nothing seen beyond 8 m': _seen_within(8.0),
     '5 cm of noise': _of_ranges(_noisy),
     'a tenth of the rays random': _of_ranges(_random_rays),
+    'a fifth of the rays through glass': _of_ranges(_glass),
+    'a laser that hangs unsaid': _hanging,
     'backwards in time': _backwards,
     'mirrored': _mirrored,
     'worse wheels': _worse_wheels,
     'carried away': _carried,
+    'carried away for 20 s': _carried_for(20),
     'no scans for 5 s of 100': _with_gaps(5),
     'no scans for 20 s of 100': _with_gaps(20),
     'no wheels': _without_wheels,

@@ -24,7 +24,8 @@ cells that both know, so many are free in both or occupied in both. Seconds are 
 one thread, and of the front end alone: what a scan costs `scan_loops`.
 
 With --variants a row for each log made of a recorded one, see `log_variants`: the error where a
-scan is near a corrected pose, false loops and all, parts, and the doubts of the map.
+scan is near a corrected pose, false loops and all, parts, the doubts of the map, and what else is
+said.
 """
 
 import argparse
@@ -196,9 +197,11 @@ def print_variants(given: argparse.Namespace) -> None:
             error = absolute_trajectory_error(
                 se2.compose(poses[keyframes], steps)[near, :2], drawn.truth[rows][near, :2])
             doubts = outcome.judgement.doubts if outcome.judgement else ()
-            said = ', '.join(dict.fromkeys(doubt.kind for doubt in doubts)) or 'none'
+            # `solve` doubts a drive in parts, too.
+            kinds = [doubt.kind for doubt in doubts] + ['parts'] * (outcome.parts > 1)
+            said = ', '.join(dict.fromkeys(kinds)) or 'none'
             print(f'{name}, {variant}: error {error:.3f} m, {outcome.parts} parts; doubts: {said}',
-                  flush=True)
+                  *made.record.skipped, sep='; ', flush=True)
 
 
 def main() -> None:

@@ -14,9 +14,8 @@ A laser log over DDS, faster than it was driven: the map of `scan_loops` and `ba
 LOG is a CARMEN log, TRUTH a table of `stamp,x,y,theta`. Both nodes run as shipped, each a process
 of its own; the log is sent as LaserScan and Odometry, so many scans a second. Said is what each
 process took of a core for a scan, its memory, how long updates of the map took, what the front end
-says of itself, and the error of the map at the truth's stamps: where the Path has the keyframe
-before, and `scan_odom` from there. A straight line between keyframes would not do: a robot that
-stands, and goes on, is not on it. With GROUPS, see `small.py`, the two nodes share the first core
+says of itself, and the error of the map, measured as `solve --reference` measures the map of the
+recording: see `path_error`. With GROUPS, see `small.py`, the two nodes share the first core
 within these control groups, and what plays to them runs elsewhere.
 """
 
@@ -33,6 +32,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
+from path_error import path_error
 from peer import UpdateTimes, arguments, cpu_seconds
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.serialization import deserialize_message
@@ -40,17 +40,14 @@ from sensor_msgs.msg import LaserScan
 from small import groups_most
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, poses_at
 from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.io.scans.carmen import read_carmen
-from l1slam_ros.io.trajectory import read_reference
 from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.shell.header import header
 
 RATE = 40.0
 # Both nodes' parameters.
 _SHIPPED = Path(__file__).parents[2] / 'config' / 'scan_loops.yaml'
-_LONGEST, _FARTHEST = 10 * 10**9, 10.0  # [ns], [m] of odometry from a keyframe
 _COMPILING, _END = 60.0, 30.0  # [s] nothing is sent before; the map may change after the last
 
 
@@ -146,19 +143,9 @@ def _memory(process: int) -> float:
 
 
 def _error(path: PathMessage, way: list[Odometry], truth: Path) -> float:
-    """Return the RMSE of positions [m] at the truth's stamps."""
-    true = read_reference(truth, se2, by_stamps=True)
+    """Return the RMSE of positions [m], as `solve --reference` does."""
     keyframes, poses = _stamped([(p.header, p.pose) for p in path.poses])
-    stamps, odometry = _stamped([(m.header, m.pose.pose) for m in way])
-    rows, there = poses_at(se2, stamps, odometry, true.keys, _LONGEST, 0)
-    rows, there = rows[true.keys[rows] >= keyframes[0]], there[true.keys[rows] >= keyframes[0]]
-    before = np.searchsorted(keyframes, true.keys[rows], side='right') - 1
-    _, from_there = poses_at(se2, stamps, odometry, keyframes[before], _LONGEST, 0)
-    step = se2.between(from_there, there)
-    found = se2.compose(poses[before], step)
-    # Between the last scan of a part and the first of the next there is no odometry.
-    known = np.hypot(step[:, 0], step[:, 1]) < _FARTHEST
-    return absolute_trajectory_error(found[known, :2], true.poses[rows[known], :2])
+    return path_error(keyframes, poses, *_stamped([(m.header, m.pose.pose) for m in way]), truth)
 
 
 def _stamped(messages: list[tuple[Any, Any]]) -> tuple[np.ndarray, np.ndarray]:

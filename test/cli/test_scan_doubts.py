@@ -124,6 +124,9 @@ def solved(case, folder, capsys):
 def test_no_wrong_map_in_silence(case, tmp_path, capsys):
     code, said = solved(case, tmp_path, capsys)
     assert said['ate'] < 0.1 or (code == 4 and said['status'] == 'doubtful'), said
+    # That scans turn against the wheels is said where they do, and nowhere else.
+    hangs = any(' is the laser upside down? ' in sentence for sentence in said['warnings'])
+    assert hangs == (case == 'upside down')
 
 
 @pytest.mark.parametrize('case', list(CASES)[:4])

@@ -32,6 +32,7 @@ from l1slam_ros.core.scans.matching import Match, match
 from l1slam_ros.core.scans.points import Points, rotated, transformed
 from l1slam_ros.core.scans.search import search
 from l1slam_ros.core.scans.submaps import Keyframe, Submap, seen_by, submap_of, submap_of_scan
+from l1slam_ros.core.scans.wheels import Calibration, wheel_covariance
 
 # So many keyframes are the map that scans are matched with.
 _MAP = 4
@@ -59,18 +60,12 @@ _SEARCHED = np.diag((0.1, 0.1, 0.05)) ** 2
 _FEWEST = 30
 _LOST_AFTER = 6
 _LOST_WAY = 1.0
-# Wheels: part of the way and of the turn, turn for each metre, and of each scan [m, rad].
-_WAY = 0.3
-_TURN = 0.2
-_TURN_OF_WAY = 0.3
-_STEP = 0.01
-_STEP_TURN = 0.01
-# [m] So far from where it is said to be a laser may sit: what it moves when the robot turns.
-_ASIDE = 0.1
 # After scans and wheels disagreed, for so many scans the wheels may be wrong by twice their
 # motion: where a driver loses the sign of wheels that turn backwards, it does for a while.
 _DISTRUST = 25
 _WRONG = 2.0
+# Of the wheels' variance scans left so much less: they measured the motion.
+_SURE = 10.0
 # [m] Wheels that are 5% wrong make a right map a wrong one over so long a way.
 _LONG = 5.0
 _BY_WHEELS = (f'scans did not show over {_LONG:.0f} m how far the robot went, as in a bare '
@@ -138,6 +133,7 @@ class ScanOdometry:
         self._distrusted = 0
         # Where a scan was matched last, and the wheels' way and turns since.
         self._known, self._blind = np.zeros(3), np.zeros(2)
+        self._calibration = Calibration()
         # How far it went since scans showed how far [m].
         self._by_wheels = 0.0
 
@@ -146,7 +142,7 @@ class ScanOdometry:
         if self._wheels is None or self._field is None:
             self._wheels = wheels
             return self._begin(stamp, points)
-        motion = se2.between(self._wheels[None], wheels[None])[0]
+        motion = self._calibration.follow(se2.between(self._wheels[None], wheels[None])[0])
         self._wheels = wheels
         expected = se2.compose(self._pose[None], motion[None])[0]
         self._told = se2.compose(self._told[None], motion[None])[0]
@@ -173,6 +169,7 @@ class ScanOdometry:
     def end_drive(self) -> None:
         """Let the next scan be the first of another drive: a part of its own."""
         self._wheels = None
+        self._calibration = Calibration()
         self._unmatched = 0
         self._distrusted = 0
         self._blind = np.zeros(2)
@@ -302,7 +299,8 @@ class ScanOdometry:
         if self._unmatched or done < 1.0:
             return Step(self._pose, None, covariance, said)
         keyframe = Keyframe(stamp, self._pose, points, last.part, last.travelled + way)
-        said = '; '.join(filter(None, (said, self._said_of_length(moved, way))))
+        said = '; '.join(filter(None, (
+            said, self._calibration.said_of_turn(moved), self._said_of_length(moved, way))))
         self._keep(keyframe)
         return Step(self._pose, keyframe, covariance, said)
 
@@ -316,9 +314,13 @@ class ScanOdometry:
         """
         along = rotated(np.array([0.0, 0.0, -moved[2]]), moved[None, :2])[0]
         known = along @ self._covariance[:2, :2] @ along
+        allowed = along @ self._untold[:2, :2] @ along
         before = self._by_wheels
-        by_wheels = 2 * known > along @ self._untold[:2, :2] @ along
-        self._by_wheels = before + way if by_wheels else 0.0
+        self._by_wheels = before + way if 2 * known > allowed else 0.0
+        if not self._distrusted:
+            told = se2.between(self.keyframes[-1].pose[None], self._told[None])[0]
+            self._calibration.learn(told, moved, (
+                _SURE * known < allowed, _SURE * self._covariance[2, 2] < self._untold[2, 2]))
         return _BY_WHEELS if before < _LONG <= self._by_wheels else ''
 
     def _begin(self, stamp: int, points: Points, said: str = '') -> Step:
@@ -336,6 +338,7 @@ class ScanOdometry:
     def _keep(self, keyframe: Keyframe) -> None:
         """Take a keyframe into the map that scans are matched with."""
         self.keyframes.append(keyframe)
+        self._calibration.begin_step()
         local = submap_of(self.keyframes, len(self.keyframes) - 1, before=_MAP - 1, after=0)
         self._map = local
         # In the frame of the odometry, where poses are.
@@ -343,12 +346,3 @@ class ScanOdometry:
                                rotated(keyframe.pose, local.normals))
         self._covariance = np.zeros((3, 3))
         self._told, self._untold = keyframe.pose, self._covariance
-
-
-def wheel_covariance(motion: Array) -> Array:
-    """Return the covariance of a motion (3,) of the wheels, (3, 3) in the axes of its end."""
-    way = float(np.hypot(motion[0], motion[1]))
-    turn = abs(float(motion[2]))
-    along = (_WAY * way) ** 2 + (_ASIDE * turn) ** 2 + _STEP**2
-    heading = (_TURN * turn) ** 2 + (_TURN_OF_WAY * way) ** 2 + _STEP_TURN**2
-    return np.diag((along, along, heading))

@@ -126,14 +126,33 @@ def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
     if velocity is not None and scan.time_increment:
         xy = _at_stamp(xy, velocity, scan.time_increment * np.arange(0.0, len(ranges)))
     view = _view(np.where(hit, ranges, np.inf)[looked], angles[looked])
-    seen = xy[hit]
-    normals = np.zeros_like(seen)
     noise = _noise(reach, hit, abs(scan.angle_increment))
+    widest = max(_NORMAL_REACH, _REACH_OF_NOISE * noise)
+    widening = _RAYS * abs(scan.angle_increment)
+    lone = _lone(xy[hit], np.maximum(widest, widening * reach[hit]))
+    seen, stray = xy[hit][~lone], xy[hit][lone]
+    normals = np.zeros_like(seen)
     count = kernels.surface_along(
-        seen, centre, SPACING, max(_NORMAL_REACH, _REACH_OF_NOISE * noise),
-        _RAYS * abs(scan.angle_increment), max(_OFF_LINE, _OFF_OF_NOISE * noise),
+        seen, centre, SPACING, widest, widening, max(_OFF_LINE, _OFF_OF_NOISE * noise),
         np.empty_like(seen), normals)
-    return Points(seen[:count].copy(), normals[:count].copy(), centre, view)
+    return Points(np.concatenate((seen[:count], stray)),
+                  np.concatenate((normals[:count], np.zeros_like(stray))), centre, view)
+
+
+def _lone(xy: Array, reach: Array) -> Mask:
+    """
+    Return which points (n, 2) in a row hang together with neither neighbour.
+
+    They are of no surface, and what is on both sides of one may be: rays that go through glass, or
+    end anywhere, would cut walls to pieces, too short for a normal.
+
+    reach : (n,) within which neighbours are [m]; half as far they hang together, as on a surface
+    """
+    way = np.hypot(*np.diff(xy, axis=0).T)
+    alone = np.full((2, len(xy)), True)
+    alone[0, 1:] = way > 0.5 * reach[1:]
+    alone[1, :-1] = way > 0.5 * reach[:-1]
+    return alone[0] & alone[1]
 
 
 def _at_stamp(xy: Array, velocity: Array, seconds: Array) -> Array:

@@ -103,3 +103,16 @@ def test_a_noisy_laser_sees_surfaces_as_well(rng):
     off = abs(angle - np.round(angle / (np.pi / 2)) * np.pi / 2)
     assert len(normals) > 0.9 * len(points.xy)
     assert np.degrees(np.quantile(off, 0.8)) < 8
+
+
+def test_stray_rays_do_not_cut_a_wall_to_pieces(rng):
+    ranges = ranges_at(np.array([1.5, 1.5, 0.0]), rng, rays=720)
+    angles = 2 * np.pi * np.arange(720) / 720
+    whole = points_of(Scan(0, ranges, 0.0, angles[1], 0.05, 30.0))
+    through = rng.random(720) < 0.2
+    spoilt = np.where(through, ranges + 1 + 5 * rng.random(720), ranges)
+    points = points_of(Scan(0, spoilt, 0.0, angles[1], 0.05, 30.0))
+    assert len(points.surface[0]) > 0.75 * 0.8 * len(whole.surface[0])
+    # What went through is seen, and of no surface.
+    far = np.hypot(*points.xy.T)
+    assert np.isin(np.round(spoilt[through], 6), np.round(far, 6)).mean() > 0.9
