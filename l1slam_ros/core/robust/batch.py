@@ -16,8 +16,8 @@ Noise
     What a file states of its noise may be off by a constant, one for odometry and one for loops:
     `gating.noise_variance` finds both from the loops themselves (expectation and maximisation),
     `rounds` measures them again as the map grows. In the last rounds factors may be as noisy as
-    they say, so that none is refused for being worse than its like; but only loops that are a
-    tail of the noise, and stand apart from all that are further off.
+    they say, so that no loop is refused for what it was predicted too well; but only loops that
+    fit by the noise that was found.
 A true loop
     measures where its keyframes are, with normal noise. Predicted by the map without it, its
     innovation r has a covariance C from samples of the map (`innovation`), and r'C^-1 r stays
@@ -42,8 +42,8 @@ A slip
 A drift
     is an error of all steps, the same on each metre. Where loops are left out, or the odometry is
     far noisier than it says, it is a third explanation, asked before slips: odometry rid of it has
-    to win places or be less noisy (`drift`). Where all came in because the drift was learnt as
-    noise, it is seen in what they leave of the odometry.
+    to win places or be less noisy (`drift`). Where it stays in, as while driving, it is seen in
+    what loops leave of the odometry, if it was learnt as noise.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
@@ -66,7 +66,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
-from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
+from l1slam_ros.core.robust.forecast import right_within
 from l1slam_ros.core.robust.innovation import chi2_quantile, covariances, spread_of
 from l1slam_ros.core.robust.judgement import (
     NORM,
@@ -153,20 +153,16 @@ class _Repair:
         return straight or without_slip(found, as_stated)
 
     def _straightened(self, as_stated: Growth) -> Growth | None:
-        """Return the state without a drift that explains the loops, or was taken for noise."""
-        if len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISY:
-            best, rival = likeliest([straight for drift in likely_drifts(self._graph).tolist()
-                                     for straight in self._without(drift)], as_stated)
-            if best:
-                self.drift = best.drift
-                self.rival = rival
-                return best.found
-        taken = drift_taken_for_noise(as_stated)
-        for straight in self._without(taken) if taken else ():
-            if straight.keeps_places(as_stated):
-                self.drift = taken
-                return straight.found
-        return None
+        """Return the state without a drift that explains loops, None: there is none."""
+        if not len(as_stated.undecided()) and as_stated.noise.variance[0] <= NOISY:
+            return None
+        some = [straight for drift in likely_drifts(self._graph).tolist()
+                for straight in self._without(drift)]
+        best, self.rival = likeliest(some, as_stated)
+        if not best:
+            return None
+        self.drift = best.drift
+        return best.found
 
     def _without(self, drift: float) -> list[Straight]:
         """Return what odometry without a drift leads to, none, [], where that has no end."""
