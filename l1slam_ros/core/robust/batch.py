@@ -42,8 +42,8 @@ A slip
 A drift
     is an error of all steps, the same on each metre. Where loops are left out, or the odometry is
     far noisier than it says, it is a third explanation, asked before slips: odometry rid of it has
-    to win places or be less noisy (`drift`). Where it stays in, as while driving, it is seen in
-    what loops leave of the odometry, if it was learnt as noise.
+    to win places or be less noisy (`drift`). Where all came in because the drift was learnt as
+    noise, it is seen in what they leave of the odometry.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
@@ -66,7 +66,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
-from l1slam_ros.core.robust.forecast import right_within
+from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
 from l1slam_ros.core.robust.innovation import chi2_quantile, covariances, spread_of
 from l1slam_ros.core.robust.judgement import (
     NORM,
@@ -153,16 +153,20 @@ class _Repair:
         return straight or without_slip(found, as_stated)
 
     def _straightened(self, as_stated: Growth) -> Growth | None:
-        """Return the state without a drift that explains loops, None: there is none."""
-        if not len(as_stated.undecided()) and as_stated.noise.variance[0] <= NOISY:
-            return None
-        some = [straight for drift in likely_drifts(self._graph).tolist()
-                for straight in self._without(drift)]
-        best, self.rival = likeliest(some, as_stated)
-        if not best:
-            return None
-        self.drift = best.drift
-        return best.found
+        """Return the state without a drift that explains the loops, or was taken for noise."""
+        if len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISY:
+            best, rival = likeliest([straight for drift in likely_drifts(self._graph).tolist()
+                                     for straight in self._without(drift)], as_stated)
+            if best:
+                self.drift = best.drift
+                self.rival = rival
+                return best.found
+        taken = drift_taken_for_noise(as_stated)
+        for straight in self._without(taken) if taken else ():
+            if straight.keeps_places(as_stated):
+                self.drift = taken
+                return straight.found
+        return None
 
     def _without(self, drift: float) -> list[Straight]:
         """Return what odometry without a drift leads to, none, [], where that has no end."""

@@ -76,6 +76,10 @@ class Straight:
         usual = log_prior(self.drift, USUAL**2) - log_prior(other.drift, USUAL**2)
         return float(usual) + _log_odds(self.told, other.told)
 
+    def keeps_places(self, as_stated: Growth) -> bool:
+        """Return whether loops of as many places are accepted as without."""
+        return _places(as_stated, self.told) >= _places(as_stated, as_stated)
+
 
 def likeliest(some: list[Straight], as_stated: Growth) -> tuple[Straight | None, float]:
     """
