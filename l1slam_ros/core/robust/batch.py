@@ -16,8 +16,8 @@ Noise
     What a file states of its noise may be off by a constant, one for odometry and one for loops:
     `gating.noise_variance` finds both from the loops themselves (expectation and maximisation),
     `rounds` measures them again as the map grows. In the last rounds factors may be as noisy as
-    they say, so that none is refused for being worse than its like; but only loops that are a
-    tail of the noise, and stand apart from all that are further off.
+    they say, so that no loop is refused for what it was predicted too well; but only loops that
+    fit by the noise that was found.
 A true loop
     measures where its keyframes are, with normal noise. Predicted by the map without it, its
     innovation r has a covariance C from samples of the map (`innovation`), and r'C^-1 r stays

@@ -41,9 +41,6 @@ _RATIO_COSTS = 0.25
 _LEAST_START = 1e-9
 # A factor of ten that files are off has to be worth so much, ln: a few lies are no measure.
 _DECADE_COSTS = 5.0
-# The tail of the noise ends where the next factor is so many times further off; it is of no more
-# than this part of the believed ones.
-_APART, _TAIL = 2.0, 0.1
 # Pairs are formed of so many factors that fit best.
 _CANDIDATES = 200
 
@@ -186,25 +183,6 @@ def _pairs(found: Innovations, posterior: Posterior, rows: Indices, log_ratio: A
     square, both = found.joint(posterior, a, b) if len(a) else (np.zeros(0), np.zeros(0))
     return (np.concatenate((a, b)), np.concatenate((b, a)), np.tile(square, 2),
             np.tile(both, 2))
-
-
-def stand_apart(found: Innovations, own: float, gate: Gate, believed: int) -> Mask:
-    """
-    Return which factors may be as noisy as they say: those that stand apart from the false, (m,).
-
-    True noise has a tail, of a few, which ends. How far off false ones are has no scale: from any
-    distance to twice as far there are some more. Where all hang together, none may.
-
-    own : the variance that they state, in units of what was found; gate : what squares of true
-    factors stay below; believed : how many others are true for sure
-    """
-    limit = gate(found.freedom)
-    off = np.sqrt(found.square_with(own) / limit)
-    tail = np.append(1.0, np.sort(off[off > 1]))
-    end = tail[np.argmax(np.append(tail[1:], np.inf) > _APART * tail)]
-    few = np.count_nonzero((found.square > limit) & (off <= end)) <= _TAIL * believed
-    apart: Mask = off <= end if few else found.square <= limit
-    return apart
 
 
 def noise_variance(found: Innovations) -> Array:

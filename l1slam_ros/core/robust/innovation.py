@@ -200,13 +200,6 @@ class Innovations:
         return log_likelihood_ratio(self.square, self.log_det, self.log_claim, self.freedom,
                                     self.system.block_size)
 
-    def square_with(self, noise: float) -> Array:
-        """Return the squares if their own variance is so many times what it is, (m,)."""
-        k = self.system.block_size
-        square: Array = kernels.prediction.normalise(
-            self.spread + noise * np.eye(k), -self.system.b.reshape(-1, k))[0]
-        return square
-
     def joint(self, posterior: Posterior, first: Indices, second: Indices) -> tuple[Array, Array]:
         """
         Return the squared residual of pairs of factors together, and their `log_ratio`, (pairs,).

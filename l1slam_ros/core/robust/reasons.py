@@ -63,12 +63,10 @@ def doubts(growth: Growth, ended: bool = True, rival: float = 0.0) -> tuple[Doub
         reasons.append(_doubt(growth, ONE_PLACE, accepted))
     if growth.cut.any():
         reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
-    reasons += _other_map(growth)
+    agree = _agree(growth)
+    reasons += _other_map(growth, agree)
     reasons += [_doubt(growth, OTHER_MAP, rows) for rows in _joining_otherwise(growth)]
-    reasons += [
-        _slip_doubt(growth, step)
-        for step, odds in growth.slip_odds.items()
-        if (odds < SURE if growth.cut[step] else odds > -SURE)]
+    reasons += [_slip_doubt(growth, step) for step in _may_have_slipped(growth, agree)]
     drift = rival or drift_taken_for_noise(growth)
     if drift:
         reasons.append(replace(_doubt(growth, DRIFTS, accepted), detail=f'{-drift:+.2g}'))
@@ -148,21 +146,38 @@ def _joining_otherwise(growth: Growth) -> Iterator[Indices]:
             yield group.rows
 
 
-def _other_map(growth: Growth) -> list[Doubt]:
+def _agree(growth: Growth) -> list[Indices]:
+    """Return groups of refused loops that agree: of several places, and of one each."""
+    rows = growth.undecided()
+    place = growth.given.place
+    agree = agree_at_a_place(growth, rows)
+    groups = [strongest_group(growth, rows).rows, *(
+        agree[place[agree] == one] for one in np.unique(place[agree]))]
+    return [group for group in groups if len(group)]
+
+
+def _other_map(growth: Growth, groups: list[Indices]) -> list[Doubt]:
     """
     Return a doubt where refused loops agree, and no accepted one speaks against them.
 
     They may be right then: the odometry slipped, and nothing else knows of it. A place against
     the odometry alone is one word against another.
     """
-    rows = growth.undecided()
     accepted = growth.accepted & growth.given.is_loop
-    place = growth.given.place
-    agree = agree_at_a_place(growth, rows)
-    groups = [strongest_group(growth, rows).rows, *(
-        agree[place[agree] == one] for one in np.unique(place[agree]))]
-    alone = [group for group in groups if len(group) and _may_be_right(growth, group, accepted)]
+    alone = [group for group in groups if _may_be_right(growth, group, accepted)]
     return [_doubt(growth, OTHER_MAP, max(alone, key=len))] if alone else []
+
+
+def _may_have_slipped(growth: Growth, groups: list[Indices]) -> list[int]:
+    """
+    Return the odometry factors that slipped, or not, neither of which is nearly sure.
+
+    Of two slips each is unlikely by itself, since the other one bends what the loops across it
+    say. Refused loops that span a step and agree do so by chance as rarely as what is nearly sure.
+    """
+    told = [step for group in groups for step in common_steps(growth, group)]
+    return [step for step, odds in growth.slip_odds.items()
+            if (odds < SURE if growth.cut[step] else odds > -SURE * (1 + (step in told)))]
 
 
 def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:

@@ -22,7 +22,7 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.robust.batch_map import SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
-from l1slam_ros.core.robust.judgement import ONE_JOINS, ONE_PLACE, OTHER_MAP, Doubt
+from l1slam_ros.core.robust.judgement import ONE_JOINS, ONE_PLACE, OTHER_MAP, SLIP, Doubt
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 
@@ -158,7 +158,8 @@ def test_a_slip_that_one_place_alone_tells_of_is_doubtful(turn, doubted):
         near, near + 6, se2.retract(se2.between(true[near], true[near + 6]), noise),
         np.repeat(factors.sqrt_information[:1], len(near), axis=0))
     found, _ = robust_solve(graph)
-    assert [doubt.kind for doubt in found.doubts] == [OTHER_MAP] * doubted
+    assert [doubt.kind for doubt in found.doubts] == [OTHER_MAP, SLIP] * doubted
+    assert [doubt.first for doubt in found.doubts[1:]] == [400] * doubted
     assert np.count_nonzero(~found.accepted) == 20 * doubted
 
 

@@ -17,9 +17,10 @@ from test_pairwise_consistency import STEP, TURN, grown
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import robust_solve
-from l1slam_ros.core.robust.judgement import OTHER_MAP
+from l1slam_ros.core.robust.judgement import OTHER_MAP, SLIP
 from l1slam_ros.core.robust.odometry.motion import log_odds_of_slips, usual_motion
 from l1slam_ros.core.robust.odometry.slips import SURE, without_slip
+from l1slam_ros.core.robust.reasons import doubts
 
 
 @pytest.fixture(scope='module')
@@ -88,6 +89,18 @@ def test_what_is_within_the_noise_as_stated_is_no_slip(bad, stated, turn, named)
     graph = retold(slipped(bad.graph, STEP, (0.0, 0.0, turn)), times=stated)
     slips = robust_solve(graph)[0].slips
     assert graph.between.i[slips].tolist() == named
+
+
+@pytest.mark.parametrize('turned, odds, doubted', [
+    (True, -SURE - 1, True), (True, -2 * SURE - 1, False),
+    (False, 1 - SURE, True), (False, -SURE - 1, False)])
+def test_refused_loops_that_agree_speak_for_a_slip_that_is_unlikely_by_itself(
+        bad, turned, odds, doubted):
+    """Of two slips each is, since the other one bends what the loops across it say."""
+    growth = grown(slipped(bad.graph, STEP, TURN) if turned else bad.graph)
+    (step,) = np.flatnonzero(~growth.given.is_loop & (growth.given.low == STEP))
+    growth.slip_odds = {int(step): odds}
+    assert (SLIP in [doubt.kind for doubt in doubts(growth)]) == doubted
 
 
 def test_what_fits_the_loops_that_come_in_without_it_did_not_slip(bad):

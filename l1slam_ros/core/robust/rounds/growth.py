@@ -23,7 +23,7 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.robust.gating import believable, noise_variance, stand_apart
+from l1slam_ros.core.robust.gating import believable, noise_variance
 from l1slam_ros.core.robust.innovation import (
     LEAST_RATIO,
     Innovations,
@@ -69,8 +69,8 @@ class Growth:
     poses : (n, p) the L2 map of the accepted; posterior : of these; noise : as it was found;
     slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
     ventured : (m,) bool, loops of runs that noisier odometry explained; drops : (m,) how often
-    each was accepted and did not fit; in_tail : (m,) bool, not the loops that are too far off to
-    be as noisy as they say; check : called before long steps, raises where the work shall stop.
+    each was accepted and did not fit; fits_found : (m,) bool, not the loops that do not fit by the
+    noise that was found; check : called before long steps, raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -86,7 +86,7 @@ class Growth:
         self.slip_odds: dict[int, float] = {}
         none = np.zeros(len(given.factors), bool)
         self.ventured = none
-        self.in_tail = ~none
+        self.fits_found = ~none
         self.drops = none.astype(np.int64)
 
     def begin(self) -> None:
@@ -180,12 +180,11 @@ class Growth:
         return subgraph
 
     def take_at_their_word(self) -> None:
-        """From now on let factors be as noisy as they say; loops, where `stand_apart` has it."""
-        more = self.noise.word[1] / self.noise.variance[1]
+        """From now on let factors be as noisy as they say; loops, that fit by what was found."""
         rows = self._open(self.may_be_predicted & ~self.across() & ~self.given.factors.is_absolute)
-        if more > 1:  # else loops say no more than was found
-            self.in_tail[rows] = stand_apart(self.innovations(rows), more, self.given.gate,
-                                             int((self.accepted & self.given.is_loop).sum()))
+        if self.noise.word[1] > self.noise.variance[1]:  # else loops say no more than was found
+            found = self.innovations(rows)
+            self.fits_found[rows] = found.square < self.given.gate(found.freedom)
         self.noise = replace(self.noise, at_their_word=True)
         self.drops[:] = 0
 
@@ -292,7 +291,7 @@ class Growth:
         if not len(rows):
             return rows
         found, loops = self.innovations(rows), self.accepted & self.given.is_loop
-        fits = (found.square < self.given.gate(found.freedom)) & self.in_tail[rows]
+        fits = (found.square < self.given.gate(found.freedom)) & self.fits_found[rows]
         refused = self.given.is_loop & ~self.accepted
         refused[rows[fits]] = False
         # Taken at their word, or by the noise that one run taught, all are noisier than they are,
