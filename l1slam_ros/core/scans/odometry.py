@@ -300,17 +300,18 @@ class ScanOdometry:
             return Step(self._pose, None, covariance, said)
         keyframe = Keyframe(stamp, self._pose, points, last.part, last.travelled + way)
         said = '; '.join(filter(None, (
-            said, self._calibration.said_of_turn(moved), self._said_of_length(moved, way))))
+            said, self._calibration.said_of_turn(moved), self._compare(moved, way))))
         self._keep(keyframe)
         return Step(self._pose, keyframe, covariance, said)
 
-    def _said_of_length(self, moved: Array, way: float) -> str:
+    def _compare(self, moved: Array, way: float) -> str:
         """
-        Return what is to be said where scans do not show how far the robot went, once a stretch.
+        Learn of a step by wheels and scans; return what is to be said of how far it went.
 
-        That is, they took less than half of the variance along each motion (3,) of it.
+        Scans do not show that where they took less than half of the variance along each motion
+        (3,) of a stretch; it is said once.
 
-        way : the length of this one [m]
+        way : the length of this motion [m]
         """
         along = rotated(np.array([0.0, 0.0, -moved[2]]), moved[None, :2])[0]
         known = along @ self._covariance[:2, :2] @ along
