@@ -55,7 +55,7 @@ _SCORE = 0.42
 _RIVAL = 0.85
 _OVERLAP = 0.3
 _AGREE = 0.93
-_HELD = 0.02
+_HELD = 0.05
 # [m] A match that goes so far from the peak of the search slides.
 _WANDER = 0.4
 # Of neighbouring keyframes' submaps much is the same: a loop is half as certain as matches say.
