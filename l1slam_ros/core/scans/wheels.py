@@ -38,9 +38,10 @@ _ASIDE = 0.1
 # [m], squared: four steps of half a metre, for one slips by twice what wheels are off by for good.
 _STEPS = 100
 _AS_SAID = 4 * 0.5**2
-# [rad] Turns by so much and more tell a laser that hangs: by scans most of so many are the other
-# way. Wheels that lose the sign of a turn do so now and then.
-_A_TURN, _TURNS = 0.1, 20
+# [rad] Turns by so much and more tell a laser that hangs.
+_A_TURN = 0.1
+# By scans most of so many turns are the other way. Wheels that lose a sign do so now and then.
+_TURNS = 20
 HANGS = ('most turns are by scans the other way than by the wheels: is the laser upside down? '
          'Then its pose should say so; the map is in a mirror')
 
