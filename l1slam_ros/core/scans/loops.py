@@ -10,8 +10,8 @@
 Loop closures from scans: which keyframes to compare, and whether they show one place.
 
 In: keyframes, where the map has them, and how certain that is. Out: loops with covariances. A
-keyframe asks for those that saw nearly the same by the map, and for those that look alike as far
-as the map may be off; each is searched for without a guess, matched, and believed only if
+keyframe asks for those that saw nearly the same by the map, and for those that look alike; each is
+searched for without a guess, matched, and believed only if
 
     the score of the search and the overlap are high,
     no other place within reach fits nearly as well (two equal rooms, a corridor),
@@ -150,10 +150,9 @@ class LoopFinder:
             self._travelled.append(self._keyframes[k].travelled)
             self._part.append(self._keyframes[k].part)
         sigma = self._sigma(j, spread)
-        unsure = _SIGMAS * sigma[:, 0]
-        reach = np.clip(unsure, _LEAST_REACH, _MOST_REACH)
+        reach = np.clip(_SIGMAS * sigma[:, 0], _LEAST_REACH, _MOST_REACH)
         turn = np.clip(_SIGMAS * sigma[:, 1], _LEAST_TURN, np.pi)
-        for i, alike in self._candidates(j, poses, reach, np.maximum(unsure, 2 * reach)):
+        for i, alike in self._candidates(j, poses, reach):
             expected = se2.between(poses[i][None], poses[j][None])[0]
             self._waiting.append(
                 _Comparison(i, j, alike, expected, float(reach[i]), float(turn[i])))
@@ -191,8 +190,7 @@ class LoopFinder:
         by_map = np.hypot(np.where(known[:, None], spread, np.inf)[:j], max(since, 0.0) * _DRIFT)
         return np.fmin(way[:, None] * _DRIFT, by_map)
 
-    def _candidates(self, j: int, poses: Array, reach: Array, alike_reach: Array
-                    ) -> list[tuple[int, bool]]:
+    def _candidates(self, j: int, poses: Array, reach: Array) -> list[tuple[int, bool]]:
         """
         Return keyframes to compare with, and whether for their looks alone.
 
@@ -208,7 +206,7 @@ class LoopFinder:
         near = (distance <= reach[far]) & ~apart
         chosen: list[tuple[int, bool]] = []
         self._take(far[near], distance[near], _NEAREST, False, travelled, chosen)
-        within = far[(distance <= alike_reach[far]) | apart]
+        within = far[(distance <= 2 * reach[far]) | apart]
         looks = np.array([self._looks[i] for i in within]).reshape(-1, LOOKS) @ self._looks[j]
         alike = looks > _SIMILAR
         self._take(within[alike], -looks[alike], _ALIKE, True, travelled, chosen)
