@@ -265,7 +265,7 @@ def straight(n, step=1.0):
 
 def keyframe_samples(builder):
     """Return which sample each keyframe is, (n,)."""
-    return np.round(builder.track.keyframe_stamps / seconds(PERIOD)).astype(int)
+    return np.round(builder.keyframe_stamps / seconds(PERIOD)).astype(int)
 
 
 def loops_of(builder):

@@ -65,7 +65,7 @@ def _run(kind: str, source: str, count: int) -> None:
         pose[0] = position(kind, k / RATE, rng)
         backend.add_odometry(OdometrySample(k * _SECOND // RATE, pose, _COVARIANCE, _COVARIANCE))
         if k % (count // _REPORTS) == 0:
-            kept = len(backend._keeper._builder.track)
+            kept = len(backend._keeper._builder.robots[0].track)
             print(f'  {k:9,} messages: {_resident() - before:6.1f} MB more, {kept:9,} samples '
                   f'kept, {len(backend.snapshot().stamps)} keyframes, '
                   f'{(time.process_time() - began) / k * 1e6:.0f} us each', flush=True)

@@ -23,8 +23,7 @@ from l1slam_ros.core.graph.factor_graph import NO_PREDECESSOR, FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, Notes, OdometrySample
 from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors
-from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame, OdometryStream
-from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
+from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame
 from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.core.online.robot_odometry import GrowingGraph, RobotOdometry
 
@@ -80,31 +79,6 @@ class GraphBuilder:
     def notes(self) -> Notes:
         """Notes on messages that were refused, or used with a correction."""
         return self._shared.notes
-
-    @property
-    def base_frame(self) -> BaseFrame:
-        """That of the first robot, as far as is known."""
-        return self._base_frame_of(0)
-
-    @property
-    def stream(self) -> OdometryStream:
-        """The odometry of the first robot as it comes; a sample that is in doubt is held."""
-        return self.robots[0].stream
-
-    @property
-    def track(self) -> OdometryTrack:
-        """The odometry of the first robot so far, its keyframes and gaps."""
-        return self.robots[0].track
-
-    @property
-    def offset(self) -> Array:
-        """
-        Return what takes poses of the first robot's odometry frame to those kept here, (1, p).
-
-        The identity, until after `restore`, or at a gap, the odometry goes on from where the robot
-        was.
-        """
-        return self.robots[0].offset
 
     @property
     def keyframe_stamps(self) -> Indices:

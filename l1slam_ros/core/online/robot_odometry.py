@@ -94,14 +94,15 @@ class RobotOdometry:
     manifold : what the poses live on
     stream : passes on what is the robot's motion, and holds what may not be
     track : the odometry so far, its keyframes and gaps
-    offset : (1, p) see `GraphBuilder`
+    offset : (1, p) what takes poses of its odometry frame to those kept here: the identity, until
+        after `GraphBuilder.restore`, or at a gap, the odometry goes on from where the robot was
 
     """
 
     def __init__(self, robot: int, shared: GrowingGraph, base_frame: BaseFrame):
         self._robot = robot
         self._shared = shared
-        self._base_frame = base_frame
+        self.base_frame = base_frame
         self.manifold = shared.graph.manifold
         self.stream = OdometryStream(self.manifold, shared.notes, base_frame)
         self._motion: KeyframeMotion
@@ -281,4 +282,4 @@ class RobotOdometry:
         self._moved = True
         self._resumed = True
         self.stream = OdometryStream(
-            self.manifold, self._shared.notes, self._base_frame, resumed=True)
+            self.manifold, self._shared.notes, self.base_frame, resumed=True)

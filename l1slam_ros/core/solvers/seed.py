@@ -100,8 +100,7 @@ def seed_poses(graph: FactorGraph, cholesky: BlockCholesky | None,
     return step_part(graph, poses, x, graph.manifold.TRANSLATION)
 
 
-def first_poses(graph: FactorGraph, cholesky: BlockCholesky,
-                check: Callable[[], None] = lambda: None) -> Array:
+def first_poses(graph: FactorGraph, cholesky: BlockCholesky) -> Array:
     """
     Return poses to start from, (n, p): Algorithm 3's, or near the L2 map of a large clean graph.
 
@@ -110,19 +109,17 @@ def first_poses(graph: FactorGraph, cholesky: BlockCholesky,
     chordal = None
     if _is_large(graph):
         chordal = chordal_poses(graph, cholesky)
-        poses = None if chordal is None else _clean_map(graph, chordal, cholesky, check)
+        poses = None if chordal is None else _clean_map(graph, chordal, cholesky)
         if poses is not None:
             return poses
-    return seed_poses(graph, cholesky, check, chordal)
+    return seed_poses(graph, cholesky, chordal=chordal)
 
 
-def _clean_map(graph: FactorGraph, chordal: Array, cholesky: BlockCholesky,
-               check: Callable[[], None]) -> Array | None:
+def _clean_map(graph: FactorGraph, chordal: Array, cholesky: BlockCholesky) -> Array | None:
     """Return poses (n, p) near the L2 map, by `chordal_poses`; None: the graph is not clean."""
-    check()
     poses = linear_step(graph, placed(graph, chordal), cholesky, graph.manifold.TRANSLATION)
     if not _is_clean(graph, poses):
-        poses = minimise_l2(graph, poses, ROUGH_L2, cholesky, lambda *_: check()).poses
+        poses = minimise_l2(graph, poses, ROUGH_L2, cholesky).poses
     return poses if _is_clean(graph, poses) else None
 
 

@@ -150,7 +150,7 @@ class _Growing:
                 is_loop = topic in (self._topics.loops, REJECTED_LOOP_TOPIC)
                 name = LOOP_TOPIC if is_loop else topic
                 self._builder.add_loop(conversion.loop_in(
-                    name.removeprefix('/'), message.data, self._builder.base_frame.name,
+                    name.removeprefix('/'), message.data, self._builder.robots[0].base_frame.name,
                     self._map_frame))
                 if topic == ABSOLUTE_TOPIC:  # the first absolute pose names the map frame
                     self._map_frame = message.data.header.frame_id.removeprefix('/')
@@ -200,13 +200,13 @@ class _Growing:
         builder.finish()
         builder.add_due_loops()
         skipped = builder.notes.sentences()
-        if builder.stream.held:
-            skipped.append(f'the last message is not used: {builder.stream.reason()}')
+        if (stream := builder.robots[0].stream).held:
+            skipped.append(f'the last message is not used: {stream.reason()}')
         if waiting := len(builder.loops.waiting):
             skipped.append(f'{counted(waiting, "loop")} not used: the odometry ends before '
                            f'{"its" if waiting == 1 else "their"} times')
         return GraphRecord(builder.graph, None, np.arange(builder.graph.n_poses),
-                           builder.track.keyframe_stamps, tuple(skipped), damage)
+                           builder.keyframe_stamps, tuple(skipped), damage)
 
 
 def read_truth_topic(path: Path, topic: str, manifold: Manifold = se2) -> Reference:

@@ -25,7 +25,7 @@ from l1slam_ros.core.geometry.noise import root_of_inverse
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.innovation import sample_posterior
-from l1slam_ros.core.scans.front_end import FrontEndOptions, ScanFrontEnd
+from l1slam_ros.core.scans.front_end import ScanFrontEnd
 from l1slam_ros.core.scans.loops import ScanLoop
 from l1slam_ros.core.scans.odometry import Step
 from l1slam_ros.core.scans.points import Mount, Points, Scan
@@ -48,8 +48,7 @@ class ScanMap:
 
 
 def map_scans(scans: Iterable[tuple[Scan, Array]], mount: Mount,
-              report: Callable[[int, int], None] = lambda scans, loops: None,
-              options: FrontEndOptions = FrontEndOptions()) -> ScanMap:  # noqa: B008
+              report: Callable[[int, int], None] = lambda scans, loops: None) -> ScanMap:
     """
     Make a graph from scans; return it with the points of its keyframes.
 
@@ -58,21 +57,19 @@ def map_scans(scans: Iterable[tuple[Scan, Array]], mount: Mount,
     scans : each with the robot's pose by wheel odometry at its stamp, (3,); stamps ascend
     mount : the pose of the laser on the robot
     report : called at each keyframe with the numbers of scans and of loops so far
-    options : of the front end
 
     """
-    return map_drives([(scans, mount)], report, options)
+    return map_drives([(scans, mount)], report)
 
 
 def map_drives(drives: Iterable[tuple[Iterable[tuple[Scan, Array]], Mount]],
-               report: Callable[[int, int], None] = lambda scans, loops: None,
-               options: FrontEndOptions = FrontEndOptions()) -> ScanMap:  # noqa: B008
+               report: Callable[[int, int], None]) -> ScanMap:
     """
     Return, as `map_scans`, the graph of the scans of several drives, loops between them included.
 
     drives : scans and mount of each; in the graph each is a robot, numbered from 0
     """
-    made = _Making(ScanFrontEnd(options))
+    made = _Making(ScanFrontEnd())
     count = 0
     for scans, mount in drives:
         made.begin_drive(mount)

@@ -29,8 +29,9 @@ def fed(frames, name=''):
             assert str(error).endswith("; expected that of 'b'")
             refused += 1
     builder.finish()
-    used = builder.track.keyframe_stamps // 10**9 - 1
-    return builder.base_frame.name, used.tolist(), refused + builder.notes.refused['child_frame']
+    used = builder.keyframe_stamps // 10**9 - 1
+    refused += builder.notes.refused['child_frame']
+    return builder.robots[0].base_frame.name, used.tolist(), refused
 
 
 @pytest.mark.parametrize('frames, used', [

@@ -116,11 +116,11 @@ def test_until_loops_join_it_a_part_begins_where_the_last_one_ends():
     drive_on(builder, poses[:40], start=100.0)
     drive_on(builder, poses[40:], start=101.0)
     assert builder.notes.warned == {'new_part': 1} and not +builder.notes.refused
-    assert builder.track.gaps.tolist() == [40] and builder.graph.n_poses == 60
+    assert builder.robots[0].track.gaps.tolist() == [40] and builder.graph.n_poses == 60
     assert len(builder.graph.between) == 58
     expected = se2.compose(poses[39:40], se2.between(np.repeat(poses[40:41], 20, 0), poses[40:]))
-    assert_allclose(builder.track.keyframe_poses[40:], expected, atol=1e-9)
-    assert builder.track.keyframe_stamps[40] == seconds(101.0)
+    assert_allclose(builder.keyframe_poses[40:], expected, atol=1e-9)
+    assert builder.keyframe_stamps[40] == seconds(101.0)
     # Each part is told of, not only the first.
     assert builder.notes.news()[0].endswith('a new part of the map begins where the last one ends')
     drive_on(builder, poses[40:], start=101.0)
@@ -158,7 +158,7 @@ def test_near_a_gap_nothing_is_carried_across_it():
     drive_on(builder, poses, start=1.0)
     builder.add_loop(loop(1.0, 2.3, (1.3, 0.0, 0.0)))
     builder.add_due_loops()
-    assert builder.track.keyframe_stamps[[2, 3]].tolist() == [seconds(2.0), seconds(2.4)]
+    assert builder.keyframe_stamps[[2, 3]].tolist() == [seconds(2.0), seconds(2.4)]
     i, j, measurement = loops_of(builder)
     assert (i, j) == ([0], [2])
     assert_allclose(measurement, [[1.0, 0, 0]], atol=1e-9)
@@ -174,8 +174,8 @@ def test_one_old_stamp_is_dropped_and_two_near_ones_too():
         except MessageError as error:
             refused += error.cause == 'old_stamp'
     assert builder.notes.refused == {'old_stamp': 1} and refused == 2
-    assert_array_equal(builder.track.keyframe_stamps, [seconds(10 + k / 10) for k in range(5)])
-    assert not builder.track.gaps.size
+    assert_array_equal(builder.keyframe_stamps, [seconds(10 + k / 10) for k in range(5)])
+    assert not builder.robots[0].track.gaps.size
 
 
 @pytest.mark.parametrize('choice, poses, x', [

@@ -66,7 +66,7 @@ def assert_true(builder, poses):
 
 def test_snapshots_stay_as_they_were():
     builder = grown(curve(5), EVERY)
-    stamps, poses = builder.track.keyframe_stamps, builder.track.keyframe_poses
+    stamps, poses = builder.keyframe_stamps, builder.keyframe_poses
     before = stamps.copy(), poses.copy()
     drive_on(builder, curve(200), 5)
     assert_array_equal(stamps, before[0])
@@ -98,7 +98,7 @@ def test_a_loop_between_two_samples_is_interpolated():
     builder = grown([(k * PERIOD, 0.0, 0.0) for k in range(100)], DEFAULTS)
     added(builder, loop(1.03, 7.77, (6.74, 0.0, 0.0)))
     (i,), (j,), measurement = loops_of(builder)
-    x = builder.track.keyframe_poses[:, 0]
+    x = builder.keyframe_poses[:, 0]
     assert (x[i], x[j]) == (pytest.approx(1.0), pytest.approx(8.0))
     assert_allclose(measurement, [[7.0, 0, 0]], atol=1e-9)
 
@@ -194,7 +194,7 @@ def test_each_loop_of_the_graph_has_its_row_and_the_stamps_it_came_with():
     assert len(waiting) == len(expired) == 0
     factors = builder.graph.between
     assert_array_equal(builder.loops.rows, np.flatnonzero(~factors.is_odometry))
-    ends = builder.track.keyframe_stamps[factors.pairs[builder.loops.rows]]
+    ends = builder.keyframe_stamps[factors.pairs[builder.loops.rows]]
     assert 0 < np.abs(ends - in_graph).max() < seconds(0.5)
 
 

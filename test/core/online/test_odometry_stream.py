@@ -59,7 +59,7 @@ def timed(poses):
 
 
 def assert_same(builder, expected):
-    assert_array_equal(builder.track.keyframe_stamps, expected.track.keyframe_stamps)
+    assert_array_equal(builder.keyframe_stamps, expected.keyframe_stamps)
     assert_allclose(builder.graph.between.measurement, expected.graph.between.measurement,
                     atol=1e-12)
 
@@ -70,7 +70,8 @@ def test_a_stamp_far_ahead_is_dropped_when_the_next_one_is_right(ahead, place):
     good = timed(curve(40))
     stray = (good[place][0] - 0.05 + ahead, good[place][1])
     builder, refused = fed(good[:place] + [stray] + good[place:])
-    assert +builder.notes.refused == {'stamp_ahead': 1} and not refused and not builder.stream.held
+    assert +builder.notes.refused == {'stamp_ahead': 1} and not refused
+    assert not builder.robots[0].stream.held
     assert_same(builder, fed(good)[0])
 
 
@@ -106,7 +107,7 @@ def test_a_robot_that_pauses_loses_nothing(pause):
         builder, _ = fed(samples)
         assert builder.graph.n_poses == 40
         assert not builder.notes.refused and not builder.notes.warned
-        assert_allclose(builder.track.keyframe_poses, [pose for _, pose in samples], atol=1e-9)
+        assert_allclose(builder.keyframe_poses, [pose for _, pose in samples], atol=1e-9)
 
 
 @pytest.mark.parametrize('jump', [(5e8, 0.0), (0.0, -3e5), (1.2 * FASTEST * PERIOD, 0.0)])
@@ -138,13 +139,14 @@ def test_odometry_that_moves_its_frame_goes_on_from_where_the_robot_was(new_fram
     assert 'the robot is taken to be where it was' in builder.notes.sentences()[0]
     # The robot did not move from 119 to 120, as far as is known; then as its odometry says.
     expected = se2.compose(poses[119:120], se2.between(poses[120:121], after))
-    assert_allclose(builder.track.keyframe_poses[:120], poses[:120], atol=1e-9)
-    assert_allclose(se2.local(expected, builder.track.keyframe_poses[120:]), 0, atol=1e-9)
+    assert_allclose(builder.keyframe_poses[:120], poses[:120], atol=1e-9)
+    assert_allclose(se2.local(expected, builder.keyframe_poses[120:]), 0, atol=1e-9)
     model = OdometryOptions()
     known = np.diag(covariance_of(builder, 118))
     assert (np.sqrt(np.diag(covariance_of(builder, 119))) >= 0.1).all() and known.max() < 1e-3
     assert known.max() >= model.floor_translation**2
-    assert_allclose(builder.offset, se2.compose(poses[119:120], se2.inverse(moved[:1])), atol=1e-9)
+    offset = se2.compose(poses[119:120], se2.inverse(moved[:1]))
+    assert_allclose(builder.robots[0].offset, offset, atol=1e-9)
 
 
 def test_where_the_frame_moves_there_is_a_keyframe():
@@ -155,9 +157,9 @@ def test_where_the_frame_moves_there_is_a_keyframe():
     for k in range(20, 24):
         builder.add_odometry(odometry(k * PERIOD, (0.0, 0.0, 0.0)))
     assert builder.graph.n_poses == before + 1
-    assert builder.track.keyframe_stamps[-1] == seconds(2.0)
-    assert_allclose(builder.track.keyframe_poses[-1], (2, 0, 0), atol=1e-9)
-    assert_allclose(builder.offset, [(2, 0, 0)], atol=1e-9)
+    assert builder.keyframe_stamps[-1] == seconds(2.0)
+    assert_allclose(builder.keyframe_poses[-1], (2, 0, 0), atol=1e-9)
+    assert_allclose(builder.robots[0].offset, [(2, 0, 0)], atol=1e-9)
 
 
 @pytest.mark.parametrize('speed, period', [(40.0, 0.1), (40.0, 1.0), (40.0, 0.02), (320.0, 0.1)])
@@ -184,11 +186,12 @@ def test_the_last_sample_is_held_and_said_not_lost_in_silence():
     builder, _ = fed([*good[:19], (1e6, good[19][1])])
     builder.finish()
     assert builder.graph.n_poses == 19 and not builder.notes.refused
-    assert builder.stream.reason().startswith('odometry stamp 1000000000000000 ns is ')
+    assert builder.robots[0].stream.reason().startswith('odometry stamp 1000000000000000 ns is ')
     with pytest.raises(MessageError, match='is not after the last one, 1000000000000000 ns'):
         builder.add_odometry(odometry(1e6, good[19][1]))
     builder.add_odometry(odometry(1e6 + 0.1, good[19][1]))
-    assert builder.graph.n_poses == 21 and not builder.stream.held and not builder.notes.refused
+    assert builder.graph.n_poses == 21 and not builder.notes.refused
+    assert not builder.robots[0].stream.held
 
 
 @pytest.mark.parametrize('period', [1.0, 2.5, 30.0])
@@ -198,7 +201,7 @@ def test_slow_odometry_passes(period):
         builder, _ = fed([(1.0 + k * period, pose) for k, pose in enumerate(curve(n))])
         builder.finish()
         assert builder.graph.n_poses == n
-        assert not builder.notes.refused and not builder.stream.held
+        assert not builder.notes.refused and not builder.robots[0].stream.held
 
 
 def test_one_old_header_is_dropped_while_another_sample_is_held():
@@ -216,7 +219,7 @@ def test_a_restored_map_does_not_begin_anew():
     for k in range(3):
         with pytest.raises(MessageError, match='is not after the last one'):
             second.add_odometry(odometry(100.0 + k, (0.0, 0.0, 0.0)))
-    assert second.graph.n_poses == 61 and (np.diff(second.track.keyframe_stamps) > 0).all()
+    assert second.graph.n_poses == 61 and (np.diff(second.keyframe_stamps) > 0).all()
 
 
 def test_a_graph_of_odd_messages_comes_back_from_a_bag_exactly(tmp_path):
@@ -227,12 +230,12 @@ def test_a_graph_of_odd_messages_comes_back_from_a_bag_exactly(tmp_path):
     for _ in range(2):
         builder.add_loop(loop(1.0, 1.2, (1.0, 2.0, 0.3), np.diag([1e-12, 1e9, 1, 1, 1, 0.1])))
     assert builder.add_due_loops() == 2 and builder.graph.n_poses == 5
-    record = GraphRecord(builder.graph, None, np.arange(5), builder.track.keyframe_stamps)
+    record = GraphRecord(builder.graph, None, np.arange(5), builder.keyframe_stamps)
     write_graph_bag(tmp_path / 'bag', record)
     read = graph_from_bag(tmp_path / 'bag', None, DEFAULT_TOPICS)
     assert read.skipped == ()
     ours, theirs = builder.graph.between, read.graph.between
-    assert_array_equal(read.stamps, builder.track.keyframe_stamps)
+    assert_array_equal(read.stamps, builder.keyframe_stamps)
     assert_array_equal(np.sort(theirs.pairs, axis=0), np.sort(ours.pairs, axis=0))
     assert_allclose(theirs.measurement, ours.measurement, atol=1e-9)
     assert_allclose(theirs.sqrt_information, ours.sqrt_information, rtol=1e-6, atol=1e-6)
@@ -249,7 +252,8 @@ def test_no_recorded_graph_is_taken_for_a_fault(datasets, name):
         builder = GraphBuilder(se2, GraphBuilderOptions(KeyframeOptions(1e6, 0.0, 0.0)))
         for k, pose in enumerate(poses):
             builder.add_odometry(odometry(1.0 + k * period, pose))
-        assert not builder.notes.refused and not builder.notes.warned and not builder.stream.held
+        assert not builder.notes.refused and not builder.notes.warned
+        assert not builder.robots[0].stream.held
 
 
 @pytest.mark.parametrize('seed', range(30))
@@ -281,8 +285,8 @@ def test_whatever_comes_each_sample_is_used_held_or_counted(seed):
         builder.add_due_loops()
     assert builder.notes.refused['jump'] + builder.notes.warned['new_part'] > 0
     lost = sum(builder.notes.refused[cause] for cause in ('stamp_ahead', 'jump', 'old_stamp'))
-    assert builder.graph.n_poses + bool(builder.stream.reason()) + lost + old == 200
-    for part in np.split(builder.track.keyframe_stamps, builder.track.gaps):
+    assert builder.graph.n_poses + bool(builder.robots[0].stream.reason()) + lost + old == 200
+    for part in np.split(builder.keyframe_stamps, builder.robots[0].track.gaps):
         assert (np.diff(part) > 0).all()
     factors = builder.graph.between
     assert np.isfinite(factors.sqrt_information).all() and np.isfinite(factors.measurement).all()

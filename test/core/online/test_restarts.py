@@ -117,9 +117,9 @@ def test_a_loop_whose_end_is_not_seen_any_more_when_the_odometry_restarts():
         builder.add_odometry(odometry(1.0 + 0.1 * k, pose))
     for k, pose in enumerate(straight(20, 0.1)):
         builder.add_odometry(odometry(5.0 + 0.1 * k, pose))
-    assert builder.track.gaps.tolist() == [20]
+    assert builder.robots[0].track.gaps.tolist() == [20]
     times = np.array([2.0, 2.9, 3.9, 4.9, 5.0, 5.5]) * 1e9
-    metres, radians = builder.track.unseen(times.astype(np.int64)).T
+    metres, radians = builder.robots[0].track.unseen(times.astype(np.int64)).T
     assert (np.diff(metres[1:4]) > 0.5).all() and 1 < metres[3] < 3
     assert not metres[[0, 1, 4, 5]].any() and not radians[[0, 1, 4, 5]].any()
 
@@ -166,9 +166,10 @@ def test_late_messages_are_put_in_their_place_while_the_keyframe_is_open(source)
     order[:, [4, 5, 6]] = order[:, [6, 4, 5]]  # each tenth is a keyframe
     straight_on = in_order(samples, options, range(100))
     mixed = in_order(samples, options, order.ravel())
-    assert mixed.graph.n_poses == 10 and len(mixed.track) == len(straight_on.track) == 100
+    mixed_track, straight_track = (one.robots[0].track for one in (mixed, straight_on))
+    assert mixed.graph.n_poses == 10 and len(mixed_track) == len(straight_track) == 100
     times = np.array([sample.stamp for sample in samples])
-    assert_allclose(mixed.track.at(times), straight_on.track.at(times), atol=1e-12)
+    assert_allclose(mixed_track.at(times), straight_track.at(times), atol=1e-12)
     ours, theirs = mixed.graph.between, straight_on.graph.between
     assert_allclose(ours.measurement, theirs.measurement, atol=1e-12)
     if source != 'twist':  # which states for all the time since the message before
@@ -196,8 +197,8 @@ def test_a_clock_that_is_set_back_for_good_is_no_late_message(back):
             builder.add_odometry(odometry(time, (0.05 * k, 0.0, 0.0)))
         except MessageError as error:
             assert error.cause == 'old_stamp' and back < 1
-    assert builder.notes.warned == {'new_part': 1} and len(builder.track.gaps) == 1
-    assert builder.track.last_stamp == round((109.95 - back) * 1e9)
+    assert builder.notes.warned == {'new_part': 1} and len(builder.robots[0].track.gaps) == 1
+    assert builder.robots[0].track.last_stamp == round((109.95 - back) * 1e9)
 
 
 # What is no restart
@@ -222,7 +223,7 @@ def test_ordinary_robots_are_left_alone(rate, speed):
             builder.add_odometry(odometry(
                 100 + (k + rng.uniform(-0.2, 0.2)) / rate, pose[0] + rng.normal(0, 1e-3, 3)))
     assert not +builder.notes.refused and not builder.notes.warned
-    assert not builder.track.gaps.size and not builder.stream.held
+    assert not builder.robots[0].track.gaps.size and not builder.robots[0].stream.held
 
 
 @pytest.mark.parametrize('sign', ['source', 'covariance', None])
@@ -234,7 +235,7 @@ def test_signs_of_a_restart_count_where_the_pose_does_not_fit(sign):
         size = 1e-4 * (k - 40 + 1 if after and sign == 'covariance' else k + 1)
         sample = odometry(1.0 + 0.05 * k, (5 + 0.05 * k, 0.4 * after, 0.0), size * stated)
         builder.add_odometry(replace(sample, other_source=sign == 'source' and k == 40))
-    assert builder.track.gaps.size == (sign is not None)
+    assert builder.robots[0].track.gaps.size == (sign is not None)
     assert builder.notes.warned == ({'new_part': 1} if sign else {})
 
 
@@ -243,7 +244,7 @@ def test_another_source_that_goes_on_where_the_robot_is_changes_nothing():
     for k in range(80):
         sample = odometry(1.0 + 0.05 * k, (5 + 0.05 * k, 0.0, 0.0))
         builder.add_odometry(replace(sample, other_source=k == 40))
-    assert not builder.notes.warned and not builder.track.gaps.size
+    assert not builder.notes.warned and not builder.robots[0].track.gaps.size
 
 
 def test_a_restart_is_the_users_to_ignore():

@@ -546,6 +546,19 @@ def test_what_fails_before_an_update_looks_whether_it_is_at_work_is_not_forgotte
     assert not backend.behind().failing and len(backend.poses) == 3
 
 
+def test_work_does_not_begin_before_who_started_it_can_go_on(monkeypatch):
+    begun = threading.Event()
+
+    class Slow(threading.Thread):
+        def start(self):
+            super().start()
+            assert not begun.wait(MOMENT)
+
+    monkeypatch.setattr(threading, 'Thread', Slow)
+    Worker('slow', lambda: None).start(begun.set)
+    assert begun.wait(DEADLINE)
+
+
 def test_several_threads_may_settle_at_once():
     backend, found = Backend(EVERY), []
     drive(backend, 0, 200)

@@ -72,11 +72,11 @@ def test_a_recording_makes_the_graph_that_the_node_makes(tmp_path, fault):
     live.add_due_loops()
     write(tmp_path / 'bag', found)
     record = graph_from_bag(tmp_path / 'bag', None, DEFAULT_TOPICS)
-    assert_array_equal(record.stamps, live.track.keyframe_stamps)
+    assert_array_equal(record.stamps, live.keyframe_stamps)
     ours, theirs = live.graph.between, record.graph.between
     order = [np.lexsort(factors.pairs.T) for factors in (ours, theirs)]
     assert_array_equal(theirs.pairs[order[1]], ours.pairs[order[0]])
     np.testing.assert_allclose(theirs.sqrt_information[order[1]],
                                ours.sqrt_information[order[0]], rtol=1e-6)
-    assert (len(live.track.gaps), len(record.skipped)) == {
+    assert (len(live.robots[0].track.gaps), len(record.skipped)) == {
         'restart': (1, 1), 'silence': (0, 0), 'disorder': (0, 1)}[fault]
