@@ -21,6 +21,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest_of_components
 from l1slam_ros.core.graph.linear_system import with_world
+from l1slam_ros.core.graph.spanning_tree import pair_key
 
 # Linked are loops whose ends lie within so many metres along the way, in sum, or within the length
 # of so many ordinary steps, where keyframes are far apart; and what they claim, too.
@@ -84,11 +85,10 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     ends = np.stack((way[high] + way[low], way[high] - way[low]), axis=1) / near
     claimed = manifold.compose(with_world(manifold, chain)[low], Z)
     claim = manifold.positions(claimed) - positions[high]
-    cells, cell = np.unique(np.round(np.hstack((ends, claim / near)) / _GRAIN), axis=0,
-                            return_inverse=True)
+    cells, cell = _cells(np.round(np.hstack((ends, claim / near)) / _GRAIN))
     lowest = lowest_of_components(*_near(cells, 1 / _GRAIN), len(cells))
     place = np.unique(lowest, return_inverse=True)[1]
-    return place[cell.ravel()], ends
+    return place[cell], ends
 
 
 def mates(place: Indices, ends: Array) -> tuple[Indices, Indices]:
@@ -105,8 +105,8 @@ def join_what_no_other(place: Indices, parts: Indices, joins: Mask) -> Mask:
 
     place : (m,) of each loop; parts : (2, m) that it joins, the lower first; joins : (m,) accepted
     """
-    _, pair = np.unique(parts, axis=1, return_inverse=True)
-    pair = pair.ravel()
+    _, pair = np.unique(
+        pair_key(parts[0], parts[1], parts.max(initial=0) + 1), return_inverse=True)
     alone = np.zeros(place.max(initial=-1) + 1, bool)
     accepted = np.bincount(pair[joins], minlength=len(pair))
     of_place = place * (len(pair) + 1) + pair
@@ -130,6 +130,20 @@ def beside_refused(pairs: tuple[Indices, Indices], refused: Mask, true: Mask) ->
     of_false, of_true = ((np.count_nonzero(beside & some) + 1)
                          / (np.count_nonzero((count > 0) & some) + 1) for some in (refused, true))
     return np.where(beside, max(float(np.log(of_false / of_true)), 0.0), 0.0)
+
+
+def _cells(corners: Array) -> tuple[Array, Indices]:
+    """
+    Return the corners (n, k) without repetition, in order, and which of these each is, (n,).
+
+    `np.unique` along an axis does the same in twice the time, all of which it holds Python's lock.
+    """
+    order = np.lexsort(corners.T[::-1])
+    ordered = corners[order]
+    is_new = (np.diff(ordered, axis=0, prepend=np.nan) != 0).any(axis=1)
+    cell = np.empty(len(order), np.int64)
+    cell[order] = np.cumsum(is_new) - 1
+    return ordered[is_new], cell
 
 
 def _near(points: Array, reach: float) -> tuple[Indices, Indices]:

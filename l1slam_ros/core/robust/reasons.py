@@ -21,6 +21,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
+from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.judgement import (
@@ -131,8 +132,8 @@ def _joining_otherwise(growth: Growth) -> Iterator[Indices]:
         return
     ends = np.sort((part[given.low], part[given.high]), axis=0)
     rows = np.flatnonzero((ends[0] != ends[1]) & ~given.factors.is_absolute)
-    _, pair = np.unique(ends[:, rows], axis=1, return_inverse=True)
-    pair = pair.ravel()
+    _, pair = np.unique(
+        pair_key(ends[0, rows], ends[1, rows], part.max() + 1), return_inverse=True)
     refused = np.isin(rows, growth.undecided())
     for number in np.unique(pair[refused]):
         own = pair == number
