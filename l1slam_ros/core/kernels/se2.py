@@ -12,13 +12,12 @@ SE(2) factor by factor: the residual e = t2v(Z^-1 Xi^-1 Xj), its Jacobians and i
 z, x_i, x_j : (m, 3) measurements and poses. Formulas: see `se2`.
 
 Cosines and sines, most of the work, are found for all factors at once, eight at a time where the
-processor can: a call of the mathematical library for each takes eleven times as long.
+processor can: calls of the mathematical library for each take eleven times as long.
 """
 
 import numpy as np
 
 from l1slam_ros.core.kernels.compiled import compiled, loop
-
 
 # Coefficients of the polynomials for sine and cosine from -pi/4 to pi/4, in powers of the square,
 # of the cubic and of the fourth-order term on. Source: Sun Microsystems' fdlibm, k_sin.c, k_cos.c.
