@@ -28,18 +28,18 @@ _COSINE = (4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.4801587289
 
 
 @compiled
-def _turns(angle):
+def _turns(poses):
     """
-    Return the cosine and the sine of each angle [rad], (m,) each.
+    Return the cosine and the sine of the angle [rad] of each pose, (m,) each.
 
-    As exact as for an angle that differs by the rounding of `angle`. NaN and infinity become NaN;
+    As exact as for an angle that differs by the rounding of this one. NaN and infinity become NaN;
     an angle so large that its rounding is a turn becomes some other angle.
     """
-    c, s = np.empty_like(angle), np.empty_like(angle)
+    c, s = np.empty(len(poses)), np.empty(len(poses))
     # No branch: each choice is one between two values, or nothing would be done eight at a time.
-    for k in range(len(angle)):
-        quarters = np.rint(angle[k] * (2 / np.pi))
-        r = angle[k] - quarters * (np.pi / 2)
+    for k in range(len(poses)):
+        quarters = np.rint(poses[k, 2] * (2 / np.pi))
+        r = poses[k, 2] - quarters * (np.pi / 2)
         r = 0.0 if abs(r) > 1.0 else r
         w = r * r
         sine = _SINE[0] + w * (_SINE[1] + w * (_SINE[2] + w * (_SINE[3] + w * (
@@ -68,8 +68,8 @@ def _seen(x_i, x_j, c, s):
 def residual(z, x_i, x_j):
     """Return e (m, 3), its angle not yet wrapped."""
     e = np.empty_like(z)
-    c_z, s_z = _turns(z[:, 2])
-    c_i, s_i = _turns(x_i[:, 2])
+    c_z, s_z = _turns(z)
+    c_i, s_i = _turns(x_i)
     for f in range(len(z)):
         c, s = c_z[f], s_z[f]
         tx, ty = _seen(x_i[f], x_j[f], c_i[f], s_i[f])
@@ -84,9 +84,9 @@ def jacobians(z, x_i, x_j):
     """Return J_e_i and J_e_j, (m, 2, 3, 3)."""
     J = np.empty((len(x_i), 2, 3, 3))
     J_i, J_j = J[:, 0], J[:, 1]
-    c_z, s_z = _turns(z[:, 2])
-    c_i, s_i = _turns(x_i[:, 2])
-    c_phi, s_phi = _turns(x_j[:, 2] - x_i[:, 2] - z[:, 2])
+    c_z, s_z = _turns(z)
+    c_i, s_i = _turns(x_i)
+    c_j, s_j = _turns(x_j)
     for f in range(len(x_i)):
         J[f] = 0.0  # one by one: to go through all of it twice takes longer
         c, s = c_z[f], s_z[f]
@@ -94,8 +94,10 @@ def jacobians(z, x_i, x_j):
         J_i[f, 0, 0], J_i[f, 0, 1], J_i[f, 0, 2] = -c, -s, c * ty - s * tx
         J_i[f, 1, 0], J_i[f, 1, 1], J_i[f, 1, 2] = s, -c, -s * ty - c * tx
         J_i[f, 2, 2] = -1.0
-        J_j[f, 0, 0], J_j[f, 0, 1] = c_phi[f], -s_phi[f]
-        J_j[f, 1, 0], J_j[f, 1, 1] = s_phi[f], c_phi[f]
+        c_ij, s_ij = c_i[f] * c_j[f] + s_i[f] * s_j[f], c_i[f] * s_j[f] - s_i[f] * c_j[f]
+        c_phi, s_phi = c * c_ij + s * s_ij, c * s_ij - s * c_ij
+        J_j[f, 0, 0], J_j[f, 0, 1] = c_phi, -s_phi
+        J_j[f, 1, 0], J_j[f, 1, 1] = s_phi, c_phi
         J_j[f, 2, 2] = 1.0
     return J
 
@@ -104,15 +106,15 @@ def jacobians(z, x_i, x_j):
 def curvature(z, x_i, x_j, dual):
     """Return the rows of turns of the Hessian of dual'e, (m, 2, 1, 6); see `manifold`."""
     H = np.empty((len(x_i), 2, 1, 6))
-    c_z, s_z = _turns(z[:, 2])
-    c_i, s_i = _turns(x_i[:, 2])
-    c_theta, s_theta = _turns(x_j[:, 2] - x_i[:, 2])
+    c_z, s_z = _turns(z)
+    c_i, s_i = _turns(x_i)
+    c_j, s_j = _turns(x_j)
     for f in range(len(x_i)):
         H[f] = 0.0
         t = _seen(x_i[f], x_j[f], c_i[f], s_i[f])
         c, s = c_z[f], s_z[f]
         mx, my = c * dual[f, 0] - s * dual[f, 1], s * dual[f, 0] + c * dual[f, 1]
-        c, s = c_theta[f], s_theta[f]
+        c, s = c_i[f] * c_j[f] + s_i[f] * s_j[f], c_i[f] * s_j[f] - s_i[f] * c_j[f]
         of_i = H[f, 0, 0]
         of_i[0], of_i[1] = my, -mx
         of_i[2] = -(mx * t[0] + my * t[1])
