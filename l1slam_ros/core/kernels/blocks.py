@@ -47,13 +47,13 @@ def multiply_transposed(keyframe, blocks, y, product, size):
 
 @for_sizes('f8[:, :, ::1], f8[:, ::1]')
 def whiten(roots, vectors, size):
-    """Return L' e for each factor, (m, k); roots : (m, k, k)."""
+    """Return L' e for each factor, (m, k); roots : (m, k, k), upper triangular."""
     k = len(size)
     product = np.empty((len(roots), k))
     for f in range(len(roots)):
         for r in range(k):
             total = 0.0
-            for c in range(k):
+            for c in range(r, k):
                 total += roots[f, r, c] * vectors[f, c]
             product[f, r] = total
     return product
@@ -61,13 +61,13 @@ def whiten(roots, vectors, size):
 
 @for_sizes('f8[:, :, ::1], f8[:, ::1]')
 def unwhiten_dual(roots, duals, size):
-    """Return L y for each factor, (m, k); roots : (m, k, k) L'."""
+    """Return L y for each factor, (m, k); roots : (m, k, k) L', upper triangular."""
     k = len(size)
     product = np.empty((len(roots), k))
     for f in range(len(roots)):
         for r in range(k):
             total = 0.0
-            for c in range(k):
+            for c in range(r + 1):
                 total += roots[f, c, r] * duals[f, c]
             product[f, r] = total
     return product
@@ -75,17 +75,17 @@ def unwhiten_dual(roots, duals, size):
 
 @for_sizes('f8[:, :, ::1], f8[:, :, :, ::1]')
 def whiten_blocks(roots, blocks, size):
-    """Turn J_i and J_j of each factor into L'J_i and L'J_j, (m, 2, k, k); roots : (m, k, k)."""
+    """
+    Turn J_i and J_j of each factor into L'J_i and L'J_j, (m, 2, k, k), in place.
+
+    roots : (m, k, k), upper triangular: a row needs none above it, which may be done already
+    """
     k = len(size)
-    J = np.empty((k, k))
     for f in range(len(roots)):
         for side in range(2):
             for r in range(k):
                 for c in range(k):
-                    J[r, c] = blocks[f, side, r, c]
-            for r in range(k):
-                for c in range(k):
                     total = 0.0
-                    for a in range(k):
-                        total += roots[f, r, a] * J[a, c]
+                    for a in range(r, k):
+                        total += roots[f, r, a] * blocks[f, side, a, c]
                     blocks[f, side, r, c] = total
