@@ -11,15 +11,17 @@
 import numpy as np
 import pytest
 from lies import slipped
-from problems import chain_of, graph_of
+from problems import chain_of, graph_of, retold
 from test_pairwise_consistency import grown
 
 from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.judgement import SLIP
-from l1slam_ros.core.robust.odometry.motion import usual_motion
-from l1slam_ros.core.robust.odometry.slips import SURE
+from l1slam_ros.core.robust.odometry.motion import jump, usual_motion
+from l1slam_ros.core.robust.odometry.slips import SURE, without_slip
 from l1slam_ros.core.robust.odometry.untold import untold_slip
+from l1slam_ros.core.robust.reasons import doubts
 
 SIDE = 20
 FAR = 4 * SIDE - 1
@@ -58,9 +60,9 @@ def test_one_loop_shows_a_slip_where_the_robot_moved_on_as_ever(block, step, off
 @pytest.mark.parametrize('seed', range(3))
 def test_a_lie_is_no_slip(block, seed):
     """After a slip that fits it, the robot would have moved as it never does."""
-    graph = block.copy()
-    rng = np.random.default_rng(seed)
-    graph.between.measurement[FAR] = rng.normal(0.0, [8.0, 8.0, 2.0])
+    Z = block.between.measurement.copy()
+    Z[FAR] = np.random.default_rng(seed).normal(0.0, [8.0, 8.0, 2.0])
+    graph = retold(block, Z)
     (odds,) = odds_of(graph).values()
     assert odds < -2 * SURE
     judgement, _ = robust_solve(graph)
@@ -69,8 +71,7 @@ def test_a_lie_is_no_slip(block, seed):
 
 def test_no_refused_loop_no_slip(block):
     growth = grown(block)
-    growth.accepted[:] = True
-    assert untold_slip(growth, usual_motion(growth)) == {}
+    assert growth.accepted.all() and untold_slip(growth, usual_motion(growth)) == {}
 
 
 def test_a_step_that_an_accepted_loop_spans_is_not_untold(block):
@@ -82,3 +83,17 @@ def test_a_step_that_an_accepted_loop_spans_is_not_untold(block):
     growth = grown(graph)
     assert growth.accepted[-1] and not growth.accepted[FAR]
     assert not {30, 31} & set(untold_slip(growth, usual_motion(growth)))
+
+
+@pytest.mark.parametrize('cut, jumps', [(30, False), (55, True)])
+def test_a_step_is_hardly_the_one_that_slipped_where_the_robot_then_jumps(block, cut, jumps):
+    """Either explains the loop; after the wrong one the robot is where no step leads."""
+    growth = grown(slipped(block, [30], [0.0, 0.0, np.pi / 2]))
+    growth.cut[cut] = growth.accepted[FAR] = True
+    growth.poses = odometry_poses(block)
+    growth.solve()
+    growth.slip_odds = {cut: 2 * SURE}
+    assert (jump(growth, cut, usual_motion(growth)) > SURE) == jumps
+    assert without_slip(growth, growth) is None
+    assert (growth.slip_odds[cut] < SURE) == jumps
+    assert (SLIP in [doubt.kind for doubt in doubts(growth)]) == jumps
