@@ -15,13 +15,11 @@ from problems import chain_of, graph_of, retold
 from test_pairwise_consistency import grown
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.judgement import SLIP
-from l1slam_ros.core.robust.odometry.motion import jump, usual_motion
-from l1slam_ros.core.robust.odometry.slips import SURE, without_slip
+from l1slam_ros.core.robust.odometry.motion import usual_motion
+from l1slam_ros.core.robust.odometry.slips import SURE
 from l1slam_ros.core.robust.odometry.untold import untold_slip
-from l1slam_ros.core.robust.reasons import doubts
 
 SIDE = 20
 FAR = 4 * SIDE - 1
@@ -83,17 +81,3 @@ def test_a_step_that_an_accepted_loop_spans_is_not_untold(block):
     growth = grown(graph)
     assert growth.accepted[-1] and not growth.accepted[FAR]
     assert not {30, 31} & set(untold_slip(growth, usual_motion(growth)))
-
-
-@pytest.mark.parametrize('cut, jumps', [(30, False), (55, True)])
-def test_a_step_is_hardly_the_one_that_slipped_where_the_robot_then_jumps(block, cut, jumps):
-    """Either explains the loop; after the wrong one the robot is where no step leads."""
-    growth = grown(slipped(block, [30], [0.0, 0.0, np.pi / 2]))
-    growth.cut[cut] = growth.accepted[FAR] = True
-    growth.poses = odometry_poses(block)
-    growth.solve()
-    growth.slip_odds = {cut: 2 * SURE}
-    assert (jump(growth, cut, usual_motion(growth)) > SURE) == jumps
-    assert without_slip(growth, growth) is None
-    assert (growth.slip_odds[cut] < SURE) == jumps
-    assert (SLIP in [doubt.kind for doubt in doubts(growth)]) == jumps

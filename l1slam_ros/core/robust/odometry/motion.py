@@ -158,35 +158,3 @@ def unwhitening(growth: Growth, rows: Indices) -> Array:
     """Return what makes whitened residuals of odometry steps of it, (k, d, d)."""
     roots = growth.subgraph(rows).between.sqrt_information
     return np.linalg.inv(roots).astype(np.float64, copy=False)
-
-
-def jump(state: Growth, cut: int, motion: Motion) -> float:
-    """Return how much likelier the robot moved as measured than as it did if a step slipped."""
-    row = np.array([cut])
-    step, spread = repaired(state, cut, row)
-    # All may be as noisy as they turn out, or as they say.
-    said = state.noise.word[0] / state.noise.variance[0]
-    density = max(motion.log_density(step, noise * spread)[0] for noise in (1.0, said))
-    return float(motion.log_density(steps_of(state, row))[0] - density)
-
-
-def repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
-    """
-    Return how the robot moved at some steps if one of these slipped rather than that which is cut.
-
-    Tangents (m, k) and their covariances (m, k, k): all that follows is moved alike.
-    """
-    given = state.given
-    manifold, chain = given.graph.manifold, given.chain
-    row, count = np.array([cut]), len(steps)
-    measured = state.uncut()
-    root, spread = unwhitening(measured, row), measured.innovations(row).spread
-    low, high = given.low[row], given.high[row]
-    moved = manifold.between(state.poses[low], state.poses[high])
-    before = manifold.between(chain[given.low[steps]], np.repeat(chain[low], count, axis=0))
-    after = manifold.between(np.repeat(chain[high], count, axis=0), chain[given.high[steps]])
-    moved = manifold.compose(manifold.compose(before, np.repeat(moved, count, axis=0)), after)
-    start = manifold.identity(count)
-    carried = manifold.local_jacobian(start, moved) @ manifold.adjoint(
-        manifold.inverse(after)) @ root
-    return manifold.local(start, moved), carried @ spread @ carried.transpose(0, 2, 1)

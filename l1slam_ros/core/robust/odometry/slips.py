@@ -29,10 +29,9 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
-    jump,
     log_odds_of_slips,
-    repaired,
     steps_of,
+    unwhitening,
     usual_motion,
 )
 from l1slam_ros.core.robust.odometry.untold import untold_slip
@@ -128,26 +127,13 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
             state.slip_odds.update(dict.fromkeys(steps, evidence))
     found = found or _with_runs(growth)
     if not found:
-        growth.slip_odds |= _in_the_end(growth, as_stated, motion)
+        # In the end more is known than when it was cut.
+        now = log_odds_of_slips(growth, motion) if growth.cut.any() else None
+        growth.slip_odds |= {step: max(odds, float(now[step]))
+                             for step, odds in growth.slip_odds.items() if growth.cut[step]}
+        for step, odds in untold_slip(as_stated, motion).items():
+            growth.slip_odds[step] = max(odds, growth.slip_odds.get(step, odds))
     return found
-
-
-def _in_the_end(growth: Growth, as_stated: Growth, motion: Motion) -> dict[int, float]:
-    """
-    Return the odds of slips, by their steps, for what is known now of those that were cut.
-
-    Where the robot jumps there, the step is another one, or they are two. And of those of which
-    loops tell that were not believed.
-    """
-    odds = untold_slip(as_stated, motion)
-    odds = {step: max(other, growth.slip_odds.get(step, other)) for step, other in odds.items()}
-    cut = [step for step in growth.slip_odds if growth.cut[step]]
-    now = log_odds_of_slips(growth, motion) if cut else np.zeros(0)
-    for step in cut:
-        odds[step] = max(growth.slip_odds[step], float(now[step]))
-        if (rather := jump(growth, step, motion)) > SURE:
-            odds[step] = -rather
-    return odds
 
 
 def _with_runs(growth: Growth) -> Growth | None:
@@ -284,7 +270,7 @@ def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
     stretch = np.searchsorted(ends, given.low, side='right')
     odometry = ~given.is_loop & (~state.cut | (np.arange(len(state.cut)) == cut))
     steps = np.flatnonzero(odometry & (stretch == stretch[cut]))
-    gain = motion.log_density(*repaired(state, cut, steps)) - motion.log_density(
+    gain = motion.log_density(*_repaired(state, cut, steps)) - motion.log_density(
         steps_of(state, steps))
     return int(steps[np.argmax(gain)])
 
@@ -336,7 +322,33 @@ def _moves_as_usual(state: Growth, cut: int, motion: Motion) -> bool:
     A slip is as rare as a mistake that many loops share. So the odds of the one against the other
     are those of the motion that each leaves.
     """
-    step, spread = repaired(state, cut, np.array([cut]))
+    row = np.array([cut])
+    repaired, spread = _repaired(state, cut, row)
     gate = state.given.gate(np.array([len(motion.mean)]))[0]
-    return bool(motion.distance(step[0], spread[0]).min() < gate
-                or jump(state, cut, motion) < 0)
+    # All may be as noisy as they turn out, or as they say.
+    said = state.noise.word[0] / state.noise.variance[0]
+    density = max(motion.log_density(repaired, noise * spread)[0] for noise in (1.0, said))
+    return bool(motion.distance(repaired[0], spread[0]).min() < gate
+                or density > motion.log_density(steps_of(state, row))[0])
+
+
+def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
+    """
+    Return how the robot moved at some steps if one of these slipped rather than that which is cut.
+
+    Tangents (m, k) and their covariances (m, k, k): all that follows is moved alike.
+    """
+    given = state.given
+    manifold, chain = given.graph.manifold, given.chain
+    row, count = np.array([cut]), len(steps)
+    measured = state.uncut()
+    root, spread = unwhitening(measured, row), measured.innovations(row).spread
+    low, high = given.low[row], given.high[row]
+    moved = manifold.between(state.poses[low], state.poses[high])
+    before = manifold.between(chain[given.low[steps]], np.repeat(chain[low], count, axis=0))
+    after = manifold.between(np.repeat(chain[high], count, axis=0), chain[given.high[steps]])
+    moved = manifold.compose(manifold.compose(before, np.repeat(moved, count, axis=0)), after)
+    start = manifold.identity(count)
+    carried = manifold.local_jacobian(start, moved) @ manifold.adjoint(
+        manifold.inverse(after)) @ root
+    return manifold.local(start, moved), carried @ spread @ carried.transpose(0, 2, 1)
