@@ -128,7 +128,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     found = found or _with_runs(growth)
     if not found:
         # In the end more is known than when it was cut.
-        now = log_odds_of_slips(growth, motion) if growth.cut.any() else None
+        now = log_odds_of_slips(growth, motion) if growth.cut.any() else np.zeros(0)
         growth.slip_odds |= {step: max(odds, float(now[step]))
                              for step, odds in growth.slip_odds.items() if growth.cut[step]}
         for step, odds in untold_slip(as_stated, motion).items():
