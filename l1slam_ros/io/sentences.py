@@ -65,8 +65,7 @@ _REASONS = {
     ONE_JOINS: 'two parts of the map are joined only by loops of one place ({loops}, {where}), '
                'which may be one mistake',
     OTHER_MAP: '{loops} refused loops agree with each other on another map, {where}',
-    SLIP: 'the odometry may have slipped {where}: the {loops} loops across it that are used do '
-          'not decide that',
+    SLIP: 'the odometry may have slipped {where}: {loops} loops across it do not decide that',
     DRIFTS: 'the odometry may turn by about {detail} rad per metre too much, {where}: the {loops} '
             'loops that are used do not decide that',
     UNFINISHED: 'the judgement of the loops did not come to an end: the {loops} loops that are '

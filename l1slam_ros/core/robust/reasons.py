@@ -208,6 +208,8 @@ def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
 
 def _slip_doubt(growth: Growth, step: int) -> Doubt:
     given = growth.given
-    across = given.factors.pairs[growth.accepted & given.spanning(step)]
+    span = given.spanning(step)
+    used = growth.accepted & span
+    across = given.factors.pairs[used if used.any() else span]
     return Doubt(SLIP, len(across), int(given.low[step]), int(given.high[step]),
                  pairs=listed(across))

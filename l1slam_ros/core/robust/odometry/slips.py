@@ -34,6 +34,7 @@ from l1slam_ros.core.robust.odometry.motion import (
     unwhitening,
     usual_motion,
 )
+from l1slam_ros.core.robust.odometry.untold import untold_slip
 from l1slam_ros.core.robust.pairwise_consistency import (
     RUN,
     Group,
@@ -125,11 +126,13 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
     found = found or _with_runs(growth)
-    if not found and growth.cut.any():
+    if not found:
         # In the end more is known than when it was cut.
-        now = log_odds_of_slips(growth, motion)
+        now = log_odds_of_slips(growth, motion) if growth.cut.any() else np.zeros(0)
         growth.slip_odds |= {step: max(odds, float(now[step]))
                              for step, odds in growth.slip_odds.items() if growth.cut[step]}
+        for step, odds in untold_slip(as_stated, motion).items():
+            growth.slip_odds[step] = max(odds, growth.slip_odds.get(step, odds))
     return found
 
 

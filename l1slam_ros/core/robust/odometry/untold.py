@@ -1,0 +1,99 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""
+Slips of which no accepted loop tells: a loop that is refused is a lie, or shows one.
+
+In: the end of a robust solve. Out: the step that slipped most likely, and the odds of that. Where
+few loops are, one that does not fit may be all the evidence of a slip. A lie claims anything, a
+slip explains any loop; but of a slip the loop says how the robot moved on, and of nearly all lies
+it would be a motion as it never makes.
+"""
+
+from math import lgamma
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.robust.innovation import claimed_volume
+from l1slam_ros.core.robust.odometry.motion import Motion, steps_of, unwhitening
+from l1slam_ros.core.robust.pairwise_consistency import asked, spanned
+from l1slam_ros.core.robust.rounds.growth import Growth
+
+
+def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
+    """
+    Return ln of the odds that a step slipped of which no accepted loop tells, by the step.
+
+    Of all such steps together, by the likeliest one; {}: there is none, or nothing that is
+    refused tells of it either. The refused loop is true then, else it is a lie and nothing
+    slipped. Of a step z, one of n, and y, what it was if the loop is true,
+
+        p(y as motion) p_slip(z | y) V true / (n p(z as motion) refused)
+
+    with V as much as lies claim, true and refused how many places are. A slip turns by anything
+    and moves by a Cauchy distribution, as wide as steps are long and as y is unsure.
+    """
+    given = growth.given
+    loops = growth.accepted & given.is_loop
+    rows = growth.undecided()
+    rows = asked(growth, rows[given.factors.freedom[rows] == len(motion.mean)])
+    across = spanned(given.low[loops], given.high[loops], given.graph.n_poses)
+    steps = np.flatnonzero(~given.is_loop & ~growth.cut)
+    count = len(steps)
+    steps = steps[across[given.low[steps]] == 0]
+    if not len(rows) or not len(steps):
+        return {}
+    odds = np.full(len(steps), -np.inf)
+    root, spread = unwhitening(growth, rows), growth.innovations(rows).spread
+    covariance = root @ (spread + np.eye(len(motion.mean))) @ root.transpose(0, 2, 1)
+    for row, known in zip(rows.tolist(), covariance, strict=True):
+        own = (given.low[row] <= given.low[steps]) & (given.high[row] >= given.high[steps])
+        if own.any():
+            more = _log_density(growth, motion, steps[own], row, known)
+            odds[own] = np.logaddexp(odds[own], more)
+    places = [len(np.unique(given.place[some])) + 1 for some in (loops, rows)]
+    odds += np.log(places[0] / places[1] / count) - motion.log_density(steps_of(growth, steps))
+    likeliest, all_of_them = int(np.argmax(odds)), float(np.logaddexp.reduce(odds))
+    return {int(steps[likeliest]): all_of_them} if np.isfinite(all_of_them) else {}
+
+
+def _log_density(growth: Growth, motion: Motion, steps: Indices, row: int,
+                 known: Array) -> Array:
+    """
+    Return ln p(y as motion) p_slip(z | y) V of steps z that a loop spans, (k,).
+
+    known : (d, d) the covariance of the loop, predicted without it
+    """
+    given = growth.given
+    manifold, poses = given.graph.manifold, growth.poses
+    count = len(steps)
+    first, last = (np.tile(poses[end], (count, 1)) for end in (given.low[row], given.high[row]))
+    after = manifold.between(poses[given.high[steps]], last)
+    Z = np.tile(given.factors.measurement[row], (count, 1))
+    y = manifold.compose(manifold.between(poses[given.low[steps]], first),
+                         manifold.compose(Z, manifold.inverse(after)))
+    carried = manifold.adjoint(after)
+    spread = carried @ known @ carried.transpose(0, 2, 1)
+    start = manifold.identity(count)
+    J = manifold.local_jacobian(start, y)
+    moved = motion.log_density(manifold.local(start, y), J @ spread @ J.transpose(0, 2, 1))
+    slip = manifold.local(y, given.factors.measurement[steps])
+    return moved + _log_slip(manifold, slip, spread, motion) + claimed_volume(
+        manifold, poses)[manifold.TRANSLATION].sum()
+
+
+def _log_slip(manifold: Manifold, slip: Array, spread: Array, motion: Motion) -> Array:
+    """Return the log density of slips, tangents (k, d), that are known to (k, d, d)."""
+    part = manifold.TRANSLATION
+    square = (slip[:, part] ** 2).sum(axis=1)
+    long = (motion.step[:, part] ** 2).sum(axis=1).mean()
+    wide = long + np.trace(spread[:, part, part], axis1=1, axis2=2)
+    size = (part.stop + 1) / 2
+    return (lgamma(size) - size * np.log(np.pi) + np.log(wide) / 2
+            - size * np.log(wide + square))
