@@ -75,6 +75,12 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     return Group(found, np.unique(growth.given.place[found]))
 
 
+def most_places_across(growth: Growth) -> int:
+    """Return of how many places loops agree how two parts lie to each other, at most."""
+    return max((len(strongest_group(growth, rows).places)
+                for rows in by_pair_of_parts(growth, growth.joining())), default=0)
+
+
 def longest_run(growth: Growth, rows: Indices) -> Group:
     """Return of some loops the run that most of them are of, empty where there is none."""
     rows = asked(growth, rows)
@@ -188,18 +194,17 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     if not len(a):
         return a, b, np.zeros(0)
     ends = first, second, Z
-    F, onward, _ = _follows(manifold, ends, poses, a, b)
-    error = manifold.local(Z[b], manifold.compose(F, onward))
+    ways = _follows(manifold, ends, poses, a, b)
+    error = manifold.local(Z[b], manifold.compose(ways[0], ways[1]))
     scatter = np.linalg.pinv(error.T @ error, hermitian=True)
-    near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
-    near = near[: _NEAREST * len(rows)]
+    near = _least((error @ scatter * error).sum(axis=1), _NEAREST * len(rows))
     a = a[near]
     b = b[near]
     error = error[near]
     factors = growth.subgraph(rows).between
     k = manifold.TANGENT_SIZE
     roots = factors.sqrt_information[b]
-    covariance = 2 * np.eye(k) + _spread(growth, ends, a, b, roots)
+    covariance = 2 * np.eye(k) + _spread(growth, ends, a, b, [way[near] for way in ways], roots)
     square, log_det = kernels.prediction.normalise(covariance, whiten(roots, error))
     volume = claimed_volume(manifold, poses)
     freedom = factors.freedom[b]
@@ -210,6 +215,23 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     b = b[good]
     log_ratio = log_ratio[good]
     return np.concatenate((a, b)), np.concatenate((b, a)), np.tile(log_ratio, 2)
+
+
+def _least(values: Array, count: int) -> Indices:
+    """Return where the least of some values are, (count,), in ascending order."""
+    if count >= len(values):
+        return np.argsort(values, kind='stable')
+    some = np.sort(np.argpartition(values, count - 1)[:count])
+    least: Indices = some[np.argsort(values[some], kind='stable')]
+    return least
+
+
+def by_pair_of_parts(growth: Growth, rows: Indices) -> list[Indices]:
+    """Return some loops from one part to another by the two parts that they join, (k,) each."""
+    given = growth.given
+    parts = growth.part[np.stack((given.low[rows], given.high[rows]))]
+    pair = np.sort(parts, axis=0).T @ np.array([given.graph.n_poses, 1])
+    return [rows[pair == one] for one in np.unique(pair)]
 
 
 def _ends_by_part(growth: Growth, rows: Indices, high: Indices) -> Ends:
@@ -232,17 +254,20 @@ def _follows(
     return manifold.between(poses[low[b]], poses[low[a]]), manifold.compose(Z[a], S), S
 
 
-def _spread(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) -> Array:
+def _spread(growth: Growth, ends: Ends, a: Indices, b: Indices, ways: list[Array],
+            roots: Array) -> Array:
     """
     Return what the map's uncertainty makes of the whitened difference of pairs, (pairs, k, k).
 
     To first order Ad (Za S)^-1 and -Ad (F Za S)^-1 times the steps of the first ends of a and b,
     -Ad S^-1 and the identity times those of the second ends.
+
+    ways : F, Za S and S, see `_follows`
     """
     manifold = growth.given.graph.manifold
     low, high, _ = ends
     samples, noise = growth.posterior.samples, growth.posterior.noise
-    F, onward, S = _follows(manifold, ends, growth.poses, a, b)
+    F, onward, S = ways
     J = [manifold.adjoint(manifold.inverse(T)) for T in (onward, manifold.compose(F, onward), S)]
     blocks = np.stack((roots @ J[0], -roots @ J[1], -roots @ J[2], roots), axis=1)
     keyframe = np.stack((low[a], low[b], high[a], high[b]), axis=1) - growth.posterior.fixed

@@ -31,7 +31,6 @@ from l1slam_ros.core.graph.linear_system import (
 )
 from l1slam_ros.core.solvers.block_cholesky import (
     GROWN,
-    VAST,
     BlockCholesky,
     Pattern,
     cholesky_of,
@@ -232,8 +231,7 @@ class ChangingOrder:
         """Return the order of a graph; where finding one takes long, most of it stays."""
         if before and np.array_equal(rows, before.rows):
             return before
-        k = graph.manifold.TANGENT_SIZE
-        if before and len(rows) <= GROWN * before.anew and before.pattern.work * k**3 > VAST:
+        if before and len(rows) <= GROWN * before.anew:
             return cls(rows, cholesky_of(graph, before.pattern, _FEW).pattern, before.anew)
         return cls(rows, cholesky_of(graph, None, _FEW).pattern, len(rows))
 
