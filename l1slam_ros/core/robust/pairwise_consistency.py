@@ -193,9 +193,11 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     a, b = a[alike], b[alike]
     if not len(a):
         return a, b, np.zeros(0)
-    ends = first, second, Z
-    ways = _follows(manifold, ends, poses, a, b)
-    error = manifold.local(Z[b], manifold.compose(ways[0], ways[1]))
+    known = with_world(manifold, poses)
+    # Where each says that its second end is, and by what this would have to move there.
+    said = manifold.compose(known[first], Z)
+    back = manifold.compose(known[second], manifold.inverse(said))
+    error = manifold.residual(said[b], back[a], known[second][b])
     scatter = np.linalg.pinv(error.T @ error, hermitian=True)
     near = _least((error @ scatter * error).sum(axis=1), _NEAREST * len(rows))
     a = a[near]
@@ -204,7 +206,7 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     factors = growth.subgraph(rows).between
     k = manifold.TANGENT_SIZE
     roots = factors.sqrt_information[b]
-    covariance = 2 * np.eye(k) + _spread(growth, ends, a, b, [way[near] for way in ways], roots)
+    covariance = 2 * np.eye(k) + _spread(growth, (first, second, Z), a, b, roots)
     square, log_det = kernels.prediction.normalise(covariance, whiten(roots, error))
     volume = claimed_volume(manifold, poses)
     freedom = factors.freedom[b]
@@ -254,20 +256,17 @@ def _follows(
     return manifold.between(poses[low[b]], poses[low[a]]), manifold.compose(Z[a], S), S
 
 
-def _spread(growth: Growth, ends: Ends, a: Indices, b: Indices, ways: list[Array],
-            roots: Array) -> Array:
+def _spread(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) -> Array:
     """
     Return what the map's uncertainty makes of the whitened difference of pairs, (pairs, k, k).
 
     To first order Ad (Za S)^-1 and -Ad (F Za S)^-1 times the steps of the first ends of a and b,
     -Ad S^-1 and the identity times those of the second ends.
-
-    ways : F, Za S and S, see `_follows`
     """
     manifold = growth.given.graph.manifold
     low, high, _ = ends
     samples, noise = growth.posterior.samples, growth.posterior.noise
-    F, onward, S = ways
+    F, onward, S = _follows(manifold, ends, growth.poses, a, b)
     J = [manifold.adjoint(manifold.inverse(T)) for T in (onward, manifold.compose(F, onward), S)]
     blocks = np.stack((roots @ J[0], -roots @ J[1], -roots @ J[2], roots), axis=1)
     keyframe = np.stack((low[a], low[b], high[a], high[b]), axis=1) - growth.posterior.fixed
