@@ -31,6 +31,7 @@ from l1slam_ros.core.graph.linear_system import (
 )
 from l1slam_ros.core.solvers.block_cholesky import (
     GROWN,
+    VAST,
     BlockCholesky,
     Pattern,
     cholesky_of,
@@ -231,7 +232,8 @@ class ChangingOrder:
         """Return the order of a graph; where finding one takes long, most of it stays."""
         if before and np.array_equal(rows, before.rows):
             return before
-        if before and len(rows) <= GROWN * before.anew:
+        k = graph.manifold.TANGENT_SIZE
+        if before and len(rows) <= GROWN * before.anew and before.pattern.work * k**3 > VAST:
             return cls(rows, cholesky_of(graph, before.pattern, _FEW).pattern, before.anew)
         return cls(rows, cholesky_of(graph, None, _FEW).pattern, len(rows))
 
