@@ -65,6 +65,7 @@ NOT_RUN = {
     'python benchmarks/ros/small.py': MINUTES,
     'python benchmarks/ros/scans.py': MINUTES,
     'python benchmarks/scans.py': 'takes half a minute and more; test_scans.py maps both logs',
+    'python benchmarks/robust/cost.py': MINUTES,
     'python benchmarks/robust/verdict.py': MINUTES,
     'mkdir /sys/fs/cgroup': 'needs the rights of root and control groups',
     'echo 1G > /sys/fs/cgroup': 'needs the rights of root and control groups',

@@ -88,7 +88,7 @@ class BetweenFactors:
         """(m, d) bool: which rows of the residual say something."""
         return np.asarray(np.diagonal(self.sqrt_information, axis1=1, axis2=2) != 0)
 
-    @property
+    @cached_property
     def freedom(self) -> Indices:
         """How many rows of each say something, (m,): its degrees of freedom."""
         return np.asarray(np.count_nonzero(self.speaks, axis=1))

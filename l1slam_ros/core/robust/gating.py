@@ -30,6 +30,9 @@ Gate = Callable[[Indices], Array]
 DOUBT = 0.01
 # Of places of which many are believed at one time, this part is false at most.
 _FALSE_PLACES = 1e-3
+# Where no more than this part of all are believed by themselves, others are for what they say
+# together: or a large map that is not sure of itself would grow by a loop or two a round.
+_FEW = 2e-3
 # The noise is judged by so many of the best predicted factors.
 _BEST_PREDICTED = 1000
 _ROUNDS = 100
@@ -75,7 +78,7 @@ def believable(
     place: Indices, beside: Array,
 ) -> Indices:
     """
-    Return the factors that may be believed: each by itself, or else together, (k,).
+    Return the factors that may be believed: each by itself, if these are few also together, (k,).
 
     Parameters
     ----------
@@ -92,8 +95,9 @@ def believable(
     well = (found.square < gate(found.freedom) / 2) & (believed > 0)
     good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits], place[fits],
                                                  well[fits])]
-    if not len(good):
-        good = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
+    if len(good) <= _FEW * len(fits):
+        more = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
+        good = np.union1d(good, more)
     return good
 
 

@@ -75,6 +75,12 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     return Group(found, np.unique(growth.given.place[found]))
 
 
+def most_places_across(growth: Growth) -> int:
+    """Return of how many places loops agree how two parts lie to each other, at most."""
+    return max((len(strongest_group(growth, rows).places)
+                for rows in by_pair_of_parts(growth, growth.joining())), default=0)
+
+
 def longest_run(growth: Growth, rows: Indices) -> Group:
     """Return of some loops the run that most of them are of, empty where there is none."""
     rows = asked(growth, rows)
@@ -187,19 +193,20 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     a, b = a[alike], b[alike]
     if not len(a):
         return a, b, np.zeros(0)
-    ends = first, second, Z
-    F, onward, _ = _follows(manifold, ends, poses, a, b)
-    error = manifold.local(Z[b], manifold.compose(F, onward))
+    known = with_world(manifold, poses)
+    # Where each says that its second end is, and by what this would have to move there.
+    said = manifold.compose(known[first], Z)
+    back = manifold.compose(known[second], manifold.inverse(said))
+    error = manifold.residual(said[b], back[a], known[second][b])
     scatter = np.linalg.pinv(error.T @ error, hermitian=True)
-    near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
-    near = near[: _NEAREST * len(rows)]
+    near = _least((error @ scatter * error).sum(axis=1), _NEAREST * len(rows))
     a = a[near]
     b = b[near]
     error = error[near]
     factors = growth.subgraph(rows).between
     k = manifold.TANGENT_SIZE
     roots = factors.sqrt_information[b]
-    covariance = 2 * np.eye(k) + _spread(growth, ends, a, b, roots)
+    covariance = 2 * np.eye(k) + _spread(growth, (first, second, Z), a, b, roots)
     square, log_det = kernels.prediction.normalise(covariance, whiten(roots, error))
     volume = claimed_volume(manifold, poses)
     freedom = factors.freedom[b]
@@ -210,6 +217,23 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     b = b[good]
     log_ratio = log_ratio[good]
     return np.concatenate((a, b)), np.concatenate((b, a)), np.tile(log_ratio, 2)
+
+
+def _least(values: Array, count: int) -> Indices:
+    """Return where the least of some values are, (count,), in ascending order."""
+    if count >= len(values):
+        return np.argsort(values, kind='stable')
+    some = np.sort(np.argpartition(values, count - 1)[:count])
+    least: Indices = some[np.argsort(values[some], kind='stable')]
+    return least
+
+
+def by_pair_of_parts(growth: Growth, rows: Indices) -> list[Indices]:
+    """Return some loops from one part to another by the two parts that they join, (k,) each."""
+    given = growth.given
+    parts = growth.part[np.stack((given.low[rows], given.high[rows]))]
+    pair = np.sort(parts, axis=0).T @ np.array([given.graph.n_poses, 1])
+    return [rows[pair == one] for one in np.unique(pair)]
 
 
 def _ends_by_part(growth: Growth, rows: Indices, high: Indices) -> Ends:

@@ -16,7 +16,8 @@ from problems import chain_of, graph_of, measure, straight
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.robust import innovation
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.robust import gating, innovation
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers import gauss_newton
@@ -68,6 +69,20 @@ def test_two_loops_vouch_for_each_other_only_within_the_gate_of_both(apart, beli
     growth.solve()
     rows = growth.undecided()
     assert (growth.innovations(rows).square < 1).all()
+    assert len(growth.believable(rows)) == believed
+
+
+@pytest.mark.parametrize(('few', 'believed'), [(0.3, 1), (0.4, 3)])
+def test_where_few_are_believed_by_themselves_others_come_in_together(monkeypatch, few, believed):
+    """One of three is sure; the other two vouch for each other, in this round or the next."""
+    graph = two_loops(2.5)
+    measure(graph, np.zeros((ROUND + 100, 3)), [2000], [2012],
+            se2.between(*odometry_poses(graph)[[2000, 2012], None])[0], SURE)
+    growth = Growth(graph)
+    growth.solve()
+    rows = growth.undecided()
+    assert len(rows) == 3
+    monkeypatch.setattr(gating, '_FEW', few)
     assert len(growth.believable(rows)) == believed
 
 

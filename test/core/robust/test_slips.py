@@ -18,9 +18,11 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.judgement import OTHER_MAP, SLIP
+from l1slam_ros.core.robust.odometry import slips
 from l1slam_ros.core.robust.odometry.motion import log_odds_of_slips, usual_motion
 from l1slam_ros.core.robust.odometry.slips import SURE, without_slip
 from l1slam_ros.core.robust.reasons import doubts
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 
 @pytest.fixture(scope='module')
@@ -103,7 +105,7 @@ def test_refused_loops_that_agree_speak_for_a_slip_that_is_unlikely_by_itself(
     assert (SLIP in [doubt.kind for doubt in doubts(growth)]) == doubted
 
 
-def test_what_fits_the_loops_that_come_in_without_it_did_not_slip(bad):
+def test_what_fits_the_loops_that_come_in_without_it_did_not_slip(bad, monkeypatch):
     """As if a lie had held the map elsewhere, and all loops across a step were left out for it."""
     growth = grown(bad.graph)
     (step,) = np.flatnonzero(~growth.given.is_loop & (growth.given.low == STEP))
@@ -113,6 +115,27 @@ def test_what_fits_the_loops_that_come_in_without_it_did_not_slip(bad):
     found = without_slip(growth, growth)
     assert not found.cut.any() and found.accepted[across].all()
     assert max(growth.slip_odds.values()) < -SURE
+    # Nothing came in since: to cut it again would lead to the same, and its odds stay.
+    (back,) = found.standing
+    monkeypatch.setattr(slips, 'log_odds_of_slips', lambda growth, motion: np.where(
+        np.arange(len(growth.cut)) == back, 0.0, -np.inf))
+    monkeypatch.setattr(slips, '_without', lambda growth, step: pytest.fail(f'{step} is cut'))
+    assert without_slip(found, found) is None
+    assert found.slip_odds == {back: growth.slip_odds[back]}
+    found.accepted[np.flatnonzero(across)[0]] = False
+    assert not found.standing
+
+
+def test_where_no_loops_across_agree_a_step_is_not_cut_for_an_unusual_motion(bad, monkeypatch):
+    """Nothing accepted spans it, so each side stays as it is: no map is made to find that out."""
+    growth = grown(bad.graph.subset(np.arange(len(bad.graph.between))))
+    growth.accepted[growth.given.spanning(STEP)] = False
+    growth.solve()
+    left_out = growth.given.is_loop & ~growth.accepted
+    monkeypatch.setattr(Growth, 'solve', lambda growth: pytest.fail('solved'))
+    growth.given.factors.measurement[left_out] += np.random.default_rng(0).normal(
+        0.0, 50.0, (np.count_nonzero(left_out), 3))
+    assert slips._without(growth, STEP) is None
 
 
 @pytest.mark.parametrize('seed, turn', [(0, 0.01), (1, 0.02)])

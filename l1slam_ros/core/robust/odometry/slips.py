@@ -38,7 +38,9 @@ from l1slam_ros.core.robust.odometry.untold import untold_slip
 from l1slam_ros.core.robust.pairwise_consistency import (
     RUN,
     Group,
+    by_pair_of_parts,
     longest_run,
+    most_places_across,
     runs,
     spanned,
     strongest_group,
@@ -64,15 +66,12 @@ def join(growth: Growth, by_runs: bool = False) -> bool:
 
     by_runs : where loops of two places do not, those of one that is long may
     """
-    given = growth.given
     joined = False
     while (rows := growth.joining()).size:
-        parts = growth.part[np.stack((given.low[rows], given.high[rows]))]
-        pair = np.sort(parts, axis=0).T @ np.array([given.graph.n_poses, 1])
-        groups = [strongest_group(growth, rows[pair == one]) for one in np.unique(pair)]
-        group = max(groups, key=lambda group: len(group.places))
+        group = max((strongest_group(growth, some) for some in by_pair_of_parts(growth, rows)),
+                    key=lambda group: len(group.places))
         if len(group.places) < JOINING and by_runs:
-            group = max((longest_run(growth, rows[pair == one]) for one in np.unique(pair)),
+            group = max((longest_run(growth, some) for some in by_pair_of_parts(growth, rows)),
                         key=lambda group: len(group.rows))
         elif len(group.places) < JOINING:
             return joined
@@ -109,7 +108,8 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
 
     as_stated : the state where all may be as noisy as they say; what that explains needs no slip
     """
-    growth.slip_odds = {step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
+    growth.slip_odds = growth.standing | {
+        step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
     if np.count_nonzero(~growth.given.is_loop & ~growth.cut) < _FEWEST_STEPS:
         return None
     motion = usual_motion(growth)
@@ -125,6 +125,8 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if state and evidence > most and (usual or (odds > 0 and len(steps) == 1)):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
+            if back:
+                state.put_back = dict.fromkeys(steps, (odds, state.accepted.copy()))
     found = found or _with_runs(growth)
     if not found:
         # In the end more is known than when it was cut.
@@ -147,7 +149,8 @@ def _with_runs(growth: Growth) -> Growth | None:
     given, noise = growth.given, growth.noise
     rows, loops = growth.undecided(), growth.accepted & given.is_loop
     rows = rows[~np.isin(given.place[rows], given.place[loops])]
-    if len(rows) < RUN or growth.ventured.any() or given.may_err_as_one(np.flatnonzero(loops)):
+    most = np.unique(given.place[rows], return_counts=True)[1].max(initial=0)
+    if most < RUN or growth.ventured.any() or given.may_err_as_one(np.flatnonzero(loops)):
         return None
     noisier = growth.copy()
     noisier.noise = replace(noise, variance=noise.variance * (_NOISIER, 1.0))
@@ -221,7 +224,7 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
         if len(common):
             suspects.append(int(common[np.argmax(odds[common])]))
         left_out = np.setdiff1d(left_out, group.rows)
-    return list(dict.fromkeys(suspects))
+    return [step for step in dict.fromkeys(suspects) if step not in growth.standing]
 
 
 def common_steps(growth: Growth, rows: Indices) -> Indices:
@@ -238,6 +241,10 @@ def _without(growth: Growth, step: int) -> Growth | None:
     state, span = growth.copy(), growth.given.spanning(step)
     state.cut[step] = True
     state.drops[:] = 0
+    if not (state.accepted & span).any():  # each side stays as it is
+        state.label_parts()
+        if most_places_across(state) < JOINING:
+            return None
     state.accepted[span] = state.given.trusted[span]
     state.solve()
     if not join(state) or state.across()[step]:
@@ -340,8 +347,7 @@ def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
     """
     given = state.given
     manifold, chain = given.graph.manifold, given.chain
-    row, count = np.array([cut]), len(steps)
-    measured = state.uncut()
+    measured, row, count = state.uncut(), np.array([cut]), len(steps)
     root, spread = unwhitening(measured, row), measured.innovations(row).spread
     low, high = given.low[row], given.high[row]
     moved = manifold.between(state.poses[low], state.poses[high])

@@ -68,6 +68,7 @@ class Growth:
     nothing: the gaps, and where it slipped; part : (n,) number of the part of each keyframe;
     poses : (n, p) the L2 map of the accepted; posterior : of these; noise : as it was found;
     slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
+    put_back : of those that had been cut and fit, the same and what was accepted then, (m,) bool;
     ventured : (m,) bool, loops of runs that noisier odometry explained; drops : (m,) how often
     each was accepted and did not fit; fits_found : (m,) bool, not the loops that do not fit by the
     noise that was found; check : called before long steps, raises where the work shall stop.
@@ -84,6 +85,7 @@ class Growth:
         self.posterior: Posterior
         self._order: ChangingOrder | None = None
         self.slip_odds: dict[int, float] = {}
+        self.put_back: dict[int, tuple[float, Mask]] = {}
         none = np.zeros(len(given.factors), bool)
         self.ventured = none
         self.fits_found = ~none
@@ -204,13 +206,27 @@ class Growth:
         across: Mask = self.part[self.given.low] != self.part[self.given.high]
         return across & ~self.given.factors.is_absolute
 
+    def label_parts(self) -> None:
+        """Give each keyframe the number of its part, of what is accepted now."""
+        self.part = component_labels(self.given.graph.subset(self.accepted & ~self.cut))
+
+    @property
+    def standing(self) -> dict[int, float]:
+        """
+        The odds to have slipped of steps that were put back, where nothing came in since.
+
+        To cut them again would lead to the same.
+        """
+        return {step: odds for step, (odds, accepted) in self.put_back.items()
+                if np.array_equal(accepted, self.accepted)}
+
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
         noise_fits = self.noise.is_known(self.accepted)
         while True:
             vars(self).pop('posterior', None)  # nearly as large as the factor that is made now
             if self.cut.any():
-                self.part = component_labels(self.given.graph.subset(self.accepted & ~self.cut))
+                self.label_parts()
             rows = np.flatnonzero(self.accepted)
             subgraph = self.subgraph(rows)
             self._order = ChangingOrder.of(subgraph, rows, self._order)
