@@ -35,10 +35,11 @@ _BEST_PREDICTED = 1000
 _ROUNDS = 100
 _SAME = 1e-3
 # How much more the loops' variance may be off than the odometry's, as said or else; another ratio
-# has to make each loop likelier by so much, ln. And the least scale to start from.
+# has to make each loop likelier by so much, ln.
 _RATIOS = (1.0, *(10.0**power for power in range(-6, 7) if power))
 _RATIO_COSTS = 0.25
-_LEAST_START = 1e-9
+# Variances are no less, where they would be nothing.
+TINY = 1e-9
 # A factor of ten that files are off has to be worth so much, ln: a few lies are no measure.
 _DECADE_COSTS = 5.0
 # Pairs are formed of so many factors that fit best.
@@ -216,7 +217,7 @@ def noise_variance(found: Innovations) -> Array:
 def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indices, k: int,
                   start: float) -> tuple[float, float]:
     """Return the log likelihood of the best scale of C near a start, and that scale."""
-    scale = start = max(start, _LEAST_START)
+    scale = start = max(start, TINY)
     for _ in range(_ROUNDS):
         log_ratio = log_likelihood_ratio(square / scale, log_det + freedom * np.log(scale),
                                          log_claim, freedom, k)

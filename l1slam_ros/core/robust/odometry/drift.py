@@ -26,13 +26,11 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL, log_prior
+from l1slam_ros.core.robust.rounds.evidence import FEWEST_PLACES, TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 
-# A drift that is likelier by no more than so many places are worth has a rival.
-_RIVAL_PLACES = 2
-# A drift is believed of loops of so many places at least, if it is likelier by what these are
-# worth, or if no more than this part of them fits without it.
-_DRIFT_PLACES = 4
+# A drift is believed of loops of a few places if it is likelier by what these are worth, or if no
+# more than this part of them fits without it.
 _FEW = 0.1
 # Odometry whose variance is so many times what it states may drift.
 NOISY = 4.0
@@ -95,7 +93,7 @@ def likeliest(some: list[Straight], as_stated: Growth) -> tuple[Straight | None,
         return None, 0.0
     odds, more = min(((best.log_odds(other), other.drift - best.drift)
                       for other in some if other is not best), default=(np.inf, 0.0))
-    return best, more if odds < _RIVAL_PLACES * as_stated.given.log_odds_of_place else 0.0
+    return best, more if odds < TWO_PLACES * as_stated.given.log_odds_of_place else 0.0
 
 
 def _log_odds(one: Growth, other: Growth) -> float:
@@ -124,10 +122,10 @@ def _explains(told: Growth, as_stated: Growth) -> bool:
     """
     loops, before = (np.flatnonzero(state.accepted & state.given.is_loop)
                      for state in (told, as_stated))
-    if told.given.may_err_as_one(loops, _DRIFT_PLACES):
+    if told.given.may_err_as_one(loops):
         return False
     calmer = told.noise.variance[0] <= as_stated.noise.variance[0]
-    enough = _DRIFT_PLACES * told.given.log_odds_of_place
+    enough = FEWEST_PLACES * told.given.log_odds_of_place
     return (len(before) <= _FEW * len(loops)
             or bool(calmer and _log_odds(told, as_stated) >= enough))
 

@@ -42,10 +42,9 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     spanned,
     strongest_group,
 )
+from l1slam_ros.core.robust.rounds.evidence import FEWEST_PLACES, TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 
-# Places that join two parts, and of a group that makes a slip suspected, at least.
-JOINING, SPANNING = 2, 3
 # So many steps are tried for each reason.
 _TRIED = 2
 # What is nearly sure: ln of the odds.
@@ -70,10 +69,10 @@ def join(growth: Growth, by_runs: bool = False) -> bool:
         pair = np.sort(parts, axis=0).T @ np.array([given.graph.n_poses, 1])
         groups = [strongest_group(growth, rows[pair == one]) for one in np.unique(pair)]
         group = max(groups, key=lambda group: len(group.places))
-        if len(group.places) < JOINING and by_runs:
+        if len(group.places) < TWO_PLACES and by_runs:
             group = max((longest_run(growth, rows[pair == one]) for one in np.unique(pair)),
                         key=lambda group: len(group.rows))
-        elif len(group.places) < JOINING:
+        elif len(group.places) < TWO_PLACES:
             return joined
         if not len(group.rows):
             return joined
@@ -211,7 +210,7 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
     suspects: list[int] = order[told[order] > -least].tolist()
     for _ in range(_TRIED):
         group = strongest_group(growth, left_out)
-        if len(group.places) < SPANNING:
+        if len(group.places) < FEWEST_PLACES:
             break
         common = common_steps(growth, group.rows)
         common = common[~growth.cut[common]]

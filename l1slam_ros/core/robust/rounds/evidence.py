@@ -27,9 +27,12 @@ from l1slam_ros.core.robust.places import mates, places
 
 # At most one in so many true loops is refused for its noise alone.
 REFUSED = 1e-3
-# The noise is learnt of loops of so many places at least: of fewer, errors may be one. A place
-# that joins more than this part of the keyframes is no one mistake.
-_FEWEST_PLACES, _SMALL = 3, 0.5
+# A place may be one mistake, and two that agree hardly: they join parts, and what is as likely but
+# for two has a rival. The noise is learnt of loops of so many places at least, and a slip or a
+# drift believed: of fewer, errors may be one. A place that joins more than this part of the
+# keyframes is no one mistake.
+TWO_PLACES, FEWEST_PLACES = 2, 3
+_SMALL = 0.5
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,7 @@ class Evidence:
         """What the loops of a place are worth, ln of odds: half a gate."""
         return float(self.gate(np.array([self.graph.manifold.TANGENT_SIZE]))[0] / 2)
 
-    def may_err_as_one(self, loops: Indices, fewest: int = _FEWEST_PLACES) -> bool:
+    def may_err_as_one(self, loops: Indices, fewest: int = FEWEST_PLACES) -> bool:
         """Return whether loops are of fewer places, none of which joins much of the way."""
         place = self.place[loops]
         numbers = np.unique(place)
