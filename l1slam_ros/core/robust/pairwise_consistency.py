@@ -64,10 +64,12 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     if len(rows) < 2:
         return NO_GROUP
     one, other, log_ratio = agreement(growth, rows)
-    place = np.unique(growth.given.place[rows], return_inverse=True)[1]
+    _, first, place = np.unique(growth.given.place[rows], return_index=True, return_inverse=True)
     evidence = _evidence(place, one, other, log_ratio)
     best = int(np.argmax(evidence))
-    if evidence[best] < np.log(len(rows) / DOUBT):
+    needed = np.log(len(rows) / DOUBT)
+    one_each = rows[np.sort(first)]  # in the order of `asked`, whatever places are called
+    if evidence[best] < needed or evidence[best] < needed + _by_chance(growth, one_each):
         return NO_GROUP
     found = rows[np.concatenate(([best], other[one == best]))]
     return Group(found, np.unique(growth.given.place[found]))
@@ -141,6 +143,18 @@ def _evidence(place: Indices, one: Indices, other: Indices, log_ratio: Array) ->
     return by_place.sum(axis=1)
 
 
+def _by_chance(growth: Growth, rows: Indices) -> float:
+    """
+    Return the evidence of loops of one place each whose second ends are exchanged at random.
+
+    On a sphere, or in any way that is alike everywhere, loops agree by chance far more often than
+    if what they claim filled a volume.
+    """
+    exchanged = np.random.default_rng(0).permutation(growth.given.high[rows])
+    pairs = agreement(growth, rows, exchanged)
+    return float(_evidence(np.arange(len(rows)), *pairs).max(initial=0.0))
+
+
 def spanned(low: Indices, high: Indices, n: int) -> Indices:
     """Return how many factors span the step from each of n keyframes to the next, (n - 1,)."""
     change = np.zeros(n, np.int64)
@@ -149,7 +163,8 @@ def spanned(low: Indices, high: Indices, n: int) -> Indices:
     return np.cumsum(change)[:-1]
 
 
-def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
+def agreement(growth: Growth, rows: Indices, high: Indices | None = None
+              ) -> tuple[Indices, Indices, Array]:
     """
     Return the pairs of some loops that rather agree than not, three (pairs,).
 
@@ -158,11 +173,14 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
 
     From the one loop follows the other, if the map is right about how their first ends lie to
     each other, and their second ends; whatever it says of the loops themselves.
+
+    high : (k,) second ends to ask of, None: their own
     """
     given = growth.given
     manifold = given.graph.manifold
     poses = growth.poses
-    first, second, Z = _ends_by_part(growth, rows)
+    high = given.high[rows] if high is None else high
+    first, second, Z = _ends_by_part(growth, rows, high)
     same_way = growth.part[first] * (growth.part.max() + 1) + growth.part[second]
     a, b = np.triu_indices(len(rows), 1)
     alike = same_way[a] == same_way[b]
@@ -194,10 +212,10 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     return np.concatenate((a, b)), np.concatenate((b, a)), np.tile(log_ratio, 2)
 
 
-def _ends_by_part(growth: Growth, rows: Indices) -> Ends:
+def _ends_by_part(growth: Growth, rows: Indices, high: Indices) -> Ends:
     """Return loops as from an earlier part to a later one, within a part to the later keyframe."""
     given = growth.given
-    low, high = given.low[rows], given.high[rows]
+    low = given.low[rows]
     Z = given.factors.measurement[rows]
     turn = growth.part[low] > growth.part[high]
     return (np.where(turn, high, low), np.where(turn, low, high),
