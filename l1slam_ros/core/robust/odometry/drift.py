@@ -31,8 +31,8 @@ from l1slam_ros.core.robust.rounds.growth import Growth
 
 # A drift is believed of loops of so many places at least, if it is likelier by what these are
 # worth, or if no more than this part of them fits without it. Of 3 places one of 420 worlds has a
-# false drift, half (2) changed none of 89, double made 2 worse; without the part 5 of 40 are worse,
-# by half or double of it none of 89.
+# false drift, half (2) changed none of 89, double made 2 worse; without the part 5 of 40 are
+# worse, by half or double of it none of 89.
 _DRIFT_PLACES = 4
 _FEW = 0.1
 # Odometry whose variance is so many times what it states may drift; by half or double none of 89

@@ -29,10 +29,10 @@ from l1slam_ros.core.robust.places import mates, places
 # worse, double 1.
 REFUSED = 1e-3
 # A place may be one mistake, and two that agree hardly: they join parts, and what is as likely but
-# for two has a rival. The noise is learnt of loops of so many places at least, and a slip suspected:
-# of fewer, errors may be one. A place that joins more than this part of the keyframes is no one
-# mistake. Of 89 runs parts joined by 4 places are worse in 3; noise of 6 places changed 3, slips of
-# 2 or 6 none, and none is worse; twice the part makes 1 worse.
+# for two has a rival. The noise is learnt of loops of so many places at least, and a slip is
+# suspected: of fewer, errors may be one. A place that joins more than this part of the keyframes
+# is no one mistake. Of 89 runs parts joined by 4 places are worse in 3; noise of 6 places changed
+# 3, slips of 2 or 6 none, and none is worse; twice the part makes 1 worse.
 TWO_PLACES, FEWEST_PLACES = 2, 3
 _SMALL = 0.5
 
