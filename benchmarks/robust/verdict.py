@@ -41,8 +41,10 @@ from scipy.optimize import minimize
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
 from l1slam_ros.core.robust.forecast import forecast
+from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
@@ -136,36 +138,54 @@ _DRAWN: dict[str, Callable[[np.random.Generator], Place]] = {
     'streets': drawn.streets, 'laps': drawn.laps, 'spokes': drawn.spokes, 'lawn': drawn.lawn,
     'rings': lambda rng: _ring(int(rng.integers(10**6)), rng.random() < 0.3),
     'corridors': lambda rng: _corridor(int(rng.integers(10**6)), rng.random() < 0.3)}
-_FITTED = 1
+FITTED = 1
 _LOOKED_AT = 2, 3, 4, 5, 6, 7, 8
 _NEVER_SEEN = 9
 
 
 def runs_drawn(base: int, count: int) -> Iterator[Row]:
     """Yield what became of worlds that are drawn; base : the number of their set."""
+    for name, found, asked, rng, seed in worlds_drawn(base, count):
+        report_progress(f'{name} seed {seed} of {base}: {asked}')
+        with suppress(GraphError):  # no room for so many lies
+            yield run(f'{_set(base)}{name}', found, asked, rng, seed)
+
+
+def worlds_drawn(base: int, count: int) -> Iterator[
+        tuple[str, Place, drawn.Condition, np.random.Generator, int]]:
+    """Yield worlds, each with its kind, what is made wrong in it, by which generator, its seed."""
     for number, (name, world) in enumerate(_DRAWN.items()):
-        for seed in range(count) if base != _FITTED or name != 'lawn' else ():
+        for seed in range(count) if base != FITTED or name != 'lawn' else ():
             rng = np.random.default_rng((base, number, seed))
             found, asked = world(rng), drawn.condition(rng, name == 'rings')
-            report_progress(f'{name} seed {seed} of {base}: {asked}')
-            with suppress(GraphError):  # no room for so many lies
-                yield run(f'{_set(base)}{name}', found, asked,
-                          np.random.default_rng((seed, 0, number)), seed)
+            yield name, found, asked, np.random.default_rng((seed, 0, number)), seed
 
 
 def _set(base: int) -> str:
-    return '' if base == _FITTED else f'FRESH {base}: '
+    return '' if base == FITTED else f'FRESH {base}: '
 
 
 def run_one(name: str, found: Place, condition: int, seed: int) -> Row:
     """Return what became of the map of a graph in one of `CONDITIONS`."""
-    return run(name, found, CONDITIONS[condition],
-               np.random.default_rng((seed, condition, (FIT + HELD).index(name))), seed)
+    return run(name, found, CONDITIONS[condition], generator(name, condition, seed), seed)
+
+
+def generator(name: str, condition: int, seed: int) -> np.random.Generator:
+    """Return what draws the lies of a graph in one of `CONDITIONS`."""
+    return np.random.default_rng((seed, condition, (FIT + HELD).index(name)))
 
 
 def run(name: str, found: Place, condition: drawn.Condition, rng: np.random.Generator,
         seed: int) -> Row:
     """Return what became of the map of a graph in which something is made wrong."""
+    graph, best = made_wrong(found, condition, rng)
+    row, _ = judged(name, found, graph, best, f'seed {seed} {condition}')
+    return row
+
+
+def made_wrong(found: Place, condition: drawn.Condition,
+               rng: np.random.Generator) -> tuple[FactorGraph, Array]:
+    """Return a graph in which something is made wrong, and positions (n, 2) by its true loops."""
     change, amounts, lies, share = condition
     what = changed(found, change, amounts, rng)
     graph, clean = what.graph, what.clean
@@ -176,12 +196,17 @@ def run(name: str, found: Place, condition: drawn.Condition, rng: np.random.Gene
         graph = insert_loops(graph, what.lies)
     if found.is_false.any():
         clean = found.graph.subset(~found.is_false)
-    best = solve(clean, None, SolveOptions(robust=False)).solution.poses[:, :2]
+    return graph, solve(clean, None, SolveOptions(robust=False)).solution.poses[:, :2]
+
+
+def judged(name: str, found: Place, graph: FactorGraph, best: Array,
+           asked: str) -> tuple[Row, Judgement]:
+    """Return what became of the map of a graph, see `made_wrong`, and its judgement."""
     outcome = solve(graph, None, SolveOptions(robust=True))
     judgement, poses = outcome.judgement, outcome.solution.poses[:, :2]
     assert judgement is not None
-    return Row(name, f'seed {seed} {condition}', judgement.terms, _is_wrong(found, poses, best),
-               frozenset(doubt.kind for doubt in judgement.doubts))
+    return Row(name, asked, judgement.terms, _is_wrong(found, poses, best),
+               frozenset(doubt.kind for doubt in judgement.doubts)), judgement
 
 
 def _is_wrong(found: Place, positions: Array, best: Array) -> bool:
@@ -238,7 +263,7 @@ def main() -> int:
                         help='the numbers of sets of fresh worlds, from 2 on')
     parser.add_argument('--only', nargs='+', choices=FIT + HELD, default=FIT + HELD)
     given = parser.parse_args()
-    rows = [row for base in (_FITTED, *given.fresh)
+    rows = [row for base in (FITTED, *given.fresh)
             for row in runs_drawn(base, given.drawn)]
     for name in given.only:
         for seed in range(given.seeds if name in MADE else 1):

@@ -166,8 +166,7 @@ def _robust_map(graph: FactorGraph, asked: SolveOptions, minimiser: '_Minimiser'
     unjudged = ''
     gaps = np.setdiff1d(odometry_gaps(graph), graph.firsts - 1)
     if asked.robust is None and len(gaps) > _MOST_GAPS * (graph.n_poses - 1):
-        unjudged = (f'no edge between the consecutive vertices {ids[gaps[0]]} and '
-                    f'{ids[gaps[0] + 1]}, so no chain of odometry to judge loops by')
+        unjudged = f'{_no_edge(ids, gaps)} to judge loops by'
     elif asked.robust is not False:
         robust = minimise_robustly(graph, minimiser.minimise, on_round)
         if any(doubt.kind == UNSOLVED for doubt in robust.judgement.doubts):
@@ -248,12 +247,12 @@ def _require_start(graph: FactorGraph, stored: Array | None, asked: SolveOptions
         raise GraphError('the input stores no poses to start from; expected --start seed or '
                          'odometry')
     if asked.start == 'odometry':
-        _require_chain(graph, ids, 'so no chain of odometry to start from; expected --start seed')
+        gaps = odometry_gaps(graph)
+        if len(gaps):
+            raise GraphError(f'{_no_edge(ids, gaps)} to start from; expected --start seed')
 
 
-def _require_chain(graph: FactorGraph, ids: Indices, consequence: str) -> None:
-    """Refuse a graph whose odometry has a gap."""
-    gaps = odometry_gaps(graph)
-    if len(gaps):
-        raise GraphError(f'no edge between the consecutive vertices {ids[gaps[0]]} and '
-                         f'{ids[gaps[0] + 1]}, {consequence}')
+def _no_edge(ids: Indices, gaps: Indices) -> str:
+    """Return what the first gap of an odometry means."""
+    return (f'no edge between the consecutive vertices {ids[gaps[0]]} and {ids[gaps[0] + 1]}, so '
+            'no chain of odometry')

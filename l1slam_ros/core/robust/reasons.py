@@ -44,6 +44,7 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     strongest_group,
 )
 from l1slam_ros.core.robust.places import join_what_no_other
+from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 
 
@@ -81,7 +82,7 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
     As one loop, by the median of what they say, it would not be believed by odometry alone.
     """
     given = growth.given
-    if (len(accepted) < HANDFUL or not given.may_err_as_one(accepted, 2)
+    if (len(accepted) < HANDFUL or not given.may_err_as_one(accepted, TWO_PLACES)
             or (given.trusted | given.factors.is_absolute)[accepted].any()):
         return False
     odometry = growth.copy()
@@ -194,7 +195,7 @@ def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:
     low, high = given.low, given.high
     across = spanned(low[accepted], high[accepted], given.graph.n_poses)
     untold = np.count_nonzero(across[low[common_steps(growth, group)]] == 0)
-    if given.may_err_as_one(group, 2):
+    if given.may_err_as_one(group, TWO_PLACES):
         return bool(untold >= DOUBT * np.count_nonzero(~given.is_loop))
     told = np.concatenate((low[accepted], high[accepted]))
     return bool(untold) or any(not np.ptp(ends) and ends[0] not in told

@@ -14,9 +14,10 @@ from lies import careful_world, is_false, slipped, spoilt
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import ends_in_time
-from l1slam_ros.core.robust.odometry.slips import SPANNING, common_steps
+from l1slam_ros.core.robust.odometry.slips import common_steps
 from l1slam_ros.core.robust.pairwise_consistency import spanned, strongest_group
 from l1slam_ros.core.robust.reasons import doubts
+from l1slam_ros.core.robust.rounds.evidence import FEWEST_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 
 # The robot turned by 90 degrees more, there.
@@ -41,7 +42,7 @@ def grown(graph):
 def test_loops_across_a_slip_agree(bad):
     growth = grown(slipped(bad.graph, STEP, TURN))
     group = strongest_group(growth, growth.undecided())
-    assert len(group.places) >= SPANNING
+    assert len(group.places) >= FEWEST_PLACES
     assert not is_false(bad, growth.given.factors)[group.rows].any()
     assert ((growth.given.low[group.rows] <= STEP) & (growth.given.high[group.rows] > STEP)).all()
     steps = growth.given.low[common_steps(growth, group.rows)]

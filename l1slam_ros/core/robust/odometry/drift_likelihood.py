@@ -40,6 +40,7 @@ from l1slam_ros.core.geometry.noise import covariance_of
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.robust.gating import TINY
 from l1slam_ros.core.robust.places import places
 
 # [rad/m] What wheels and gyros drift by: its standard deviation, and the most that is looked for.
@@ -63,8 +64,6 @@ _ROUNDS = 12
 _ASKED = 500
 # The density of a lie's turn.
 _EVEN = 1 / (2 * np.pi)
-# What is next to nothing.
-_TINY = 1e-9
 
 
 def likely_drifts(graph: FactorGraph) -> Array:
@@ -105,7 +104,7 @@ def _drift_likelihood(graph: FactorGraph, rows: Indices) -> '_DriftLikelihood':
     place, ends = places(graph, chain)
     return _DriftLikelihood(
         chain, way, noise, low[rows], high[rows], measured[rows], covariance[rows],
-        _weights(place[rows], ends[rows]), noise[:, 1].sum() / max(way[-1], _TINY) ** 2)
+        _weights(place[rows], ends[rows]), noise[:, 1].sum() / max(way[-1], TINY) ** 2)
 
 
 def _weights(place: Indices, ends: Array) -> Array:

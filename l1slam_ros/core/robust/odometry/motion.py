@@ -20,6 +20,7 @@ import numpy as np
 
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.robust.gating import TINY
 from l1slam_ros.core.robust.innovation import (
     claimed_volume,
     log_likelihood_ratio,
@@ -27,9 +28,7 @@ from l1slam_ros.core.robust.innovation import (
 from l1slam_ros.core.robust.rounds.growth import Growth
 
 # Motions are told apart to this part of what they are.
-_GRAIN, _TINY = 1e-3, 1e-12
-# The part of its noise that is left of a component that no other factor checks.
-_ALONE = 1e-9
+_GRAIN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def steps_of(growth: Growth, rows: Indices) -> Array:
 def usual_motion(growth: Growth) -> Motion:
     """Return how the robot moves by its odometry."""
     step = steps_of(growth, np.flatnonzero(~growth.given.is_loop & ~growth.cut))
-    least = np.diag(_GRAIN**2 * (step**2).mean(axis=0) + _TINY)
+    least = np.diag(_GRAIN**2 * (step**2).mean(axis=0) + TINY)
     translation = growth.given.graph.manifold.TRANSLATION
     width = np.full(len(least), np.pi**2 / 3)
     width[translation] = (step[:, translation] ** 2).mean()
@@ -127,7 +126,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     rows = np.flatnonzero(~given.is_loop & ~given.gap & (factors.freedom == k))
     at = np.searchsorted(np.flatnonzero(growth.accepted), rows)
     R, r = growth.posterior.moment[at], growth.posterior.residual[at]
-    inverse = np.linalg.inv(R + _ALONE * np.eye(k))
+    inverse = np.linalg.inv(R + TINY * np.eye(k))
     # Of what no other says, the residual is rounding.
     innovation = inverse @ R @ inverse @ r[:, :, None]
     measured = growth.uncut()

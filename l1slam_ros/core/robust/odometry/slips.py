@@ -45,10 +45,9 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     spanned,
     strongest_group,
 )
+from l1slam_ros.core.robust.rounds.evidence import FEWEST_PLACES, TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 
-# Places that join two parts, and of a group that makes a slip suspected, at least.
-JOINING, SPANNING = 2, 3
 # So many steps are tried for each reason.
 _TRIED = 2
 # What is nearly sure: ln of the odds.
@@ -70,10 +69,10 @@ def join(growth: Growth, by_runs: bool = False) -> bool:
     while (rows := growth.joining()).size:
         group = max((strongest_group(growth, some) for some in by_pair_of_parts(growth, rows)),
                     key=lambda group: len(group.places))
-        if len(group.places) < JOINING and by_runs:
+        if len(group.places) < TWO_PLACES and by_runs:
             group = max((longest_run(growth, some) for some in by_pair_of_parts(growth, rows)),
                         key=lambda group: len(group.rows))
-        elif len(group.places) < JOINING:
+        elif len(group.places) < TWO_PLACES:
             return joined
         if not len(group.rows):
             return joined
@@ -217,7 +216,7 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
     suspects: list[int] = order[told[order] > -least].tolist()
     for _ in range(_TRIED):
         group = strongest_group(growth, left_out)
-        if len(group.places) < SPANNING:
+        if len(group.places) < FEWEST_PLACES:
             break
         common = common_steps(growth, group.rows)
         common = common[~growth.cut[common]]
@@ -243,7 +242,7 @@ def _without(growth: Growth, step: int) -> Growth | None:
     state.drops[:] = 0
     if not (state.accepted & span).any():  # each side stays as it is
         state.label_parts()
-        if most_places_across(state) < JOINING:
+        if most_places_across(state) < TWO_PLACES:
             return None
     state.accepted[span] = state.given.trusted[span]
     state.solve()

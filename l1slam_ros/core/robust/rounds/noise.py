@@ -19,11 +19,8 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.robust.innovation import LEAST_RATIO, within_ratio
+from l1slam_ros.core.robust.innovation import within_ratio
 
-# It is learnt to be no less than this part of the variance that was found first: factors that fit
-# exactly, as of a simulator, say of ever less that it is still too much.
-_LEAST_VARIANCE = 1e-3
 # What is stated counts in the end up to so many times the variance that was found.
 _WORD = 100.0
 
@@ -73,14 +70,9 @@ class Noise:
         found = self.found(variance)
         return replace(found, first=found.variance)
 
-    def resumed(self, variance: Array) -> 'Noise':
-        """Return the noise of an earlier state, (2,): how it began is no limit any more."""
-        return replace(self.found(variance), first=np.full(2, LEAST_RATIO))
-
     def learnt(self, scale: Array, accepted: Mask) -> 'Noise':
         """Return the noise so many times as large, (2,), learnt of what is accepted, (m,)."""
-        variance = np.maximum(self.variance * scale, _LEAST_VARIANCE * self.first)
-        return replace(self.found(variance), learnt_of=accepted.copy())
+        return replace(self.found(self.variance * scale), learnt_of=accepted.copy())
 
     def forgotten(self) -> 'Noise':
         """Return the noise as if it were learnt of nothing."""
