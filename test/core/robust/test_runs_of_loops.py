@@ -10,11 +10,13 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.robust import batch
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
+from l1slam_ros.core.worlds.false_loops import grouped_false_loops, insert_loops
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 
@@ -51,3 +53,16 @@ def test_a_drift_that_is_found_a_little_otherwise_makes_no_other_map(datasets, t
         outcome.solution.poses[known[:, 0].astype(int), :2], known[:, 1:3])
     assert outcome.judgement.drift == pytest.approx(0.017 * times, rel=0.02)
     assert error < 0.8
+
+
+@pytest.mark.parametrize('seed', [5, (0, 3, 90)])
+def test_a_run_of_lies_does_not_make_the_odometry_of_a_large_map_noisier(datasets, seed):
+    """Of nine times as many grouped lies one was let in by odometry 2 and 9 times as noisy."""
+    graph = read_graph_file(datasets / 'manhattan3500.g2o').graph
+    poses = solve(graph, None, SolveOptions(robust=False, norm='l2')).solution.poses
+    true = np.count_nonzero(~graph.between.is_odometry)
+    rng = np.random.default_rng(seed)
+    lied = insert_loops(graph, grouped_false_loops(graph, poses, 9 * true, rng))
+    outcome = solve(lied, None, SolveOptions(norm='l2'))
+    assert np.count_nonzero(outcome.judgement.accepted & ~lied.between.is_odometry) == true
+    assert_allclose(outcome.solution.poses, poses, atol=1e-3)

@@ -21,7 +21,6 @@ that came in without it did not slip: a lie had bent the map.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -34,27 +33,23 @@ from l1slam_ros.core.robust.odometry.motion import (
     unwhitening,
     usual_motion,
 )
+from l1slam_ros.core.robust.odometry.noisier import with_runs
 from l1slam_ros.core.robust.odometry.untold import untold_slip
 from l1slam_ros.core.robust.pairwise_consistency import (
-    RUN,
     Group,
     by_pair_of_parts,
     longest_run,
     most_places_across,
-    runs,
     spanned,
     strongest_group,
 )
 from l1slam_ros.core.robust.rounds.evidence import FEWEST_PLACES, TWO_PLACES
-from l1slam_ros.core.robust.rounds.growth import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 
 # So many steps are tried for each reason.
 _TRIED = 2
 # What is nearly sure: ln of the odds.
 SURE = float(np.log(1 / DOUBT - 1))
-# By so much more the odometry may vary than its good steps say, for a run to be looked at; and
-# with it, than was found first, and than it states.
-_NOISIER, _MOST = 30.0, 10.0
 # Of fewer steps there is no habit.
 _FEWEST_STEPS = 20
 
@@ -116,7 +111,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     for steps, odds, state, usual in _tried(growth, as_stated, motion):
         back = _put_back(state, steps, motion) if state else None
         state, odds = back or (state, odds)
-        gain = _gain(growth, as_stated, state) if state and usual else 0.0
+        gain = gain_of_places(growth, as_stated, state) if state and usual else 0.0
         # No slip has to be believed where only a lie had bent the map.
         evidence = gain if back else odds + gain
         if len(steps) == 1:
@@ -126,7 +121,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
             state.slip_odds.update(dict.fromkeys(steps, evidence))
             if back:
                 state.put_back = dict.fromkeys(steps, (odds, state.accepted.copy()))
-    found = found or _with_runs(growth)
+    found = found or with_runs(growth)
     if not found:
         # In the end more is known than when it was cut.
         now = log_odds_of_slips(growth, motion) if growth.cut.any() else np.zeros(0)
@@ -135,41 +130,6 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         for step, odds in untold_slip(as_stated, motion).items():
             growth.slip_odds[step] = max(odds, growth.slip_odds.get(step, odds))
     return found
-
-
-def _with_runs(growth: Growth) -> Growth | None:
-    """
-    Return a state with the runs that are left out and noisier odometry explains, None: without.
-
-    The noise is learnt of the loops that came in, which are those that it is small for: a robot
-    that backs up, or slides on one floor, errs by more where nothing else looks. A run that is off
-    by no more than that, of whose place nothing is accepted, is rather true than a lie.
-    """
-    given, noise = growth.given, growth.noise
-    rows, loops = growth.undecided(), growth.accepted & given.is_loop
-    rows = rows[~np.isin(given.place[rows], given.place[loops])]
-    most = np.unique(given.place[rows], return_counts=True)[1].max(initial=0)
-    if most < RUN or growth.ventured.any() or given.may_err_as_one(np.flatnonzero(loops)):
-        return None
-    noisier = growth.copy()
-    noisier.noise = replace(noise, variance=noise.variance * (_NOISIER, 1.0))
-    noisier.solve()
-    found = noisier.innovations(rows)
-    groups = runs(growth, rows[found.square < given.gate(found.freedom)])
-    if not groups:
-        return None
-    state = growth.copy()
-    for group in groups:
-        state.accepted[group.rows] = state.ventured[group.rows] = True
-    state.noise = replace(noise, variance=noisier.noise.variance)
-    state.drops[:] = 0
-    # Once from noise that is far too large, and once from what was left of that.
-    for _ in range(2):
-        state.noise = state.noise.forgotten()
-        state.solve()
-    _accept_more(state)
-    is_noisier = state.noise.variance[0] > _MOST * min(growth.noise.first[0], 1.0)
-    return None if is_noisier or _gain(growth, growth, state) <= 0 else state
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
@@ -248,24 +208,8 @@ def _without(growth: Growth, step: int) -> Growth | None:
     state.solve()
     if not join(state) or state.across()[step]:
         return None
-    _accept_more(state)
+    state.accept_more()
     return state
-
-
-def _accept_more(state: Growth) -> None:
-    """Go through the rounds until there is nothing more to accept."""
-    while len(news := state.news()):
-        state.accepted[news] = True
-        state.solve()
-
-
-def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:
-    """Return what the places say that are won and lost by a cut, ln of odds."""
-    place, is_loop = growth.given.place, growth.given.is_loop
-    before, explained, after = (np.unique(place[state.accepted & is_loop])
-                                for state in (growth, as_stated, cut))
-    won = len(np.setdiff1d(after, np.union1d(before, explained)))
-    return growth.given.log_odds_of_place * (won - len(np.setdiff1d(before, after)))
 
 
 def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
@@ -305,7 +249,7 @@ def _cut_at(state: Growth, cut: int, step: int) -> Growth:
     state.poses = state.poses.copy()
     state.poses[between] = manifold.compose(here, manifold.between(start, chain[between]))
     state.solve()
-    _accept_more(state)
+    state.accept_more()
     return state
 
 

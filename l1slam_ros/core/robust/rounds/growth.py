@@ -209,6 +209,12 @@ class Growth:
         """Give each keyframe the number of its part, of what is accepted now."""
         self.part = component_labels(self.given.graph.subset(self.accepted & ~self.cut))
 
+    def accept_more(self) -> None:
+        """Go through the rounds until there is nothing more to accept."""
+        while len(news := self.news()):
+            self.accepted[news] = True
+            self.solve()
+
     @property
     def standing(self) -> dict[int, float]:
         """
@@ -316,3 +322,12 @@ class Growth:
         return np.asarray(rows[believable(
             found, self.posterior, self.given.gate, fits, int(true), self.given.place[rows],
             beside_refused(self.given.mates, refused, loops)[rows])])
+
+
+def gain_of_places(growth: Growth, as_stated: Growth, cut: Growth) -> float:
+    """Return what the places say that are won and lost by a cut, ln of odds."""
+    place, is_loop = growth.given.place, growth.given.is_loop
+    before, explained, after = (np.unique(place[state.accepted & is_loop])
+                                for state in (growth, as_stated, cut))
+    won = len(np.setdiff1d(after, np.union1d(before, explained)))
+    return growth.given.log_odds_of_place * (won - len(np.setdiff1d(before, after)))
