@@ -8,12 +8,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """How many loops are believed in one round, by how surely each is true, and by its place."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.core.robust.batch import robust_solve
-from l1slam_ros.core.robust.gating import DOUBT, at_once
+from l1slam_ros.core.robust.gating import DOUBT, at_once, believable, log_odds_of_false
 from l1slam_ros.core.worlds.false_loops import insert_loops, random_false_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
@@ -42,6 +44,19 @@ def test_of_many_places_all_loops_come_in():
 def test_so_many_come_in_as_one_place_in_a_thousand_is_false_of(places, doubt, believed):
     """Of few places no part is given away."""
     assert len(believed_of(np.full(places, doubt), np.arange(places))) == believed
+
+
+@pytest.mark.parametrize(('lies', 'believed'), [(100, 200), (1000, 20)])
+def test_no_part_is_given_away_where_most_lie(lies, believed):
+    """Two hundred loops of as many places, each false with .05%, beside lies that do not fit."""
+    count = 200 + lies
+    fits = np.arange(count) < 200
+    log_ratio = np.full(count, log_odds_of_false(np.full(200, 20.0), lies) + np.log(1 / 5e-4 - 1))
+    found = SimpleNamespace(log_ratio=lambda: log_ratio, square=np.ones(count),
+                            freedom=np.full(count, 3), log_det=np.zeros(count))
+    good = believable(found, None, lambda freedom: np.full(len(freedom), 16.0), fits, 1,
+                      np.arange(count), np.zeros(count))
+    assert len(good) == believed
 
 
 def test_a_place_is_as_doubtful_as_its_most_doubtful_loop():
