@@ -19,7 +19,7 @@ from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.judgement import SLIP
 from l1slam_ros.core.robust.odometry.motion import usual_motion
 from l1slam_ros.core.robust.odometry.slips import SURE
-from l1slam_ros.core.robust.odometry.untold import untold_slip
+from l1slam_ros.core.robust.odometry.untold import LEAST, untold_slip
 
 SIDE = 20
 FAR = 4 * SIDE - 1
@@ -42,13 +42,13 @@ def odds_of(graph):
     return untold_slip(growth, usual_motion(growth))
 
 
-@pytest.mark.parametrize('step, off', [(30, [0.0, 0.0, np.pi / 2]), (45, [0.0, 0.0, -np.pi / 2]),
-                                       (30, [5.0, 0.0, 0.0])])
+@pytest.mark.parametrize('step, off', [(45, [0.0, 0.0, -np.pi / 2]), (30, [5.0, 0.0, 0.0]),
+                                       (35, [5.0, 0.0, 0.0])])
 def test_one_loop_shows_a_slip_where_the_robot_moved_on_as_ever(block, step, off):
     """To turn by a right angle is nothing unusual there, so nothing else tells of it."""
     graph = slipped(block, [step], off)
     (named, odds), = odds_of(graph).items()
-    assert named == step and odds > -SURE
+    assert named == step and odds > LEAST
     judgement, _ = robust_solve(graph)
     assert [(doubt.kind, doubt.first, doubt.last) for doubt in judgement.doubts] == [
         (SLIP, step, step + 1)]

@@ -34,7 +34,7 @@ from l1slam_ros.core.robust.odometry.motion import (
     usual_motion,
 )
 from l1slam_ros.core.robust.odometry.noisier import with_runs
-from l1slam_ros.core.robust.odometry.untold import untold_slip
+from l1slam_ros.core.robust.odometry.untold import LEAST, untold_slip
 from l1slam_ros.core.robust.pairwise_consistency import (
     Group,
     by_pair_of_parts,
@@ -127,8 +127,9 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         now = log_odds_of_slips(growth, motion) if growth.cut.any() else np.zeros(0)
         growth.slip_odds |= {step: max(odds, float(now[step]))
                              for step, odds in growth.slip_odds.items() if growth.cut[step]}
-        for step, odds in untold_slip(as_stated, motion).items():
-            growth.slip_odds[step] = max(odds, growth.slip_odds.get(step, odds))
+        untold = untold_slip(as_stated, motion)
+        growth.slip_odds |= {step: max(odds, growth.slip_odds.get(step, odds))
+                             for step, odds in untold.items() if odds > LEAST}
     return found
 
 

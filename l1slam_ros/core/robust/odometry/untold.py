@@ -20,10 +20,14 @@ from math import lgamma
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.robust.forecast import CONFIDENT
 from l1slam_ros.core.robust.innovation import claimed_volume
 from l1slam_ros.core.robust.odometry.motion import Motion, steps_of, unwhitening
 from l1slam_ros.core.robust.pairwise_consistency import asked, spanned
 from l1slam_ros.core.robust.rounds.growth import Growth
+
+# ln of odds from which on such a slip is a doubt: a map that is less likely right is doubted.
+LEAST = float(np.log(1 / CONFIDENT - 1))
 
 
 def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
