@@ -36,7 +36,8 @@ _FALSE_PLACES = 1e-3
 # claim, sphere2500 kept lies. Where half lie, it takes as few rounds as without this.
 _MOST_LIE = np.log(2)
 # Where no more than this part of all are believed by themselves, others are for what they say
-# together: or a large map that is not sure of itself would grow by a loop or two a round.
+# together, or a large map that is not sure of itself would grow by a loop or two a round; likewise
+# only where few lie: with 95% lies half of what came in was false.
 _FEW = 2e-3
 # The noise is judged by so many of the best predicted factors; half and double make none worse.
 _BEST_PREDICTED = 1000
@@ -101,10 +102,11 @@ def believable(
         odds + beside, rivals(found, posterior, (fits, log_ratio, odds), place))
     # Before any is believed, or by noise that is too large, lies fit nearly as well as true ones;
     # where most lie, so many do that some fit well, and they agree more than by chance.
-    well = (found.square < gate(found.freedom) / 2) & (believed > 0) & (odds < _MOST_LIE)
+    many = believed > 0 and odds < _MOST_LIE
+    well = (found.square < gate(found.freedom) / 2) & many
     good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits], place[fits],
                                                  well[fits])]
-    if len(good) <= _FEW * len(fits):
+    if len(good) <= _FEW * len(fits) * many:
         more = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
         good = np.union1d(good, more)
     return good

@@ -40,8 +40,9 @@ def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
 
         p(y as motion) p_slip(z | y) V true / (n p(z as motion) refused)
 
-    with V as much as lies claim, true and refused how many places are. A slip turns by anything
-    and moves by a Cauchy distribution, as wide as steps are long and as y is unsure.
+    summed over the refused loops, with V as much as lies claim, true how many places are accepted
+    and refused how many loops are. A slip turns by anything and moves by a Cauchy distribution, as
+    wide as steps are long and as y is unsure.
     """
     given = growth.given
     loops = growth.accepted & given.is_loop
@@ -61,8 +62,8 @@ def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
         if own.any():
             more = _log_density(growth, motion, steps[own], row, known)
             odds[own] = np.logaddexp(odds[own], more)
-    places = [len(np.unique(given.place[some])) + 1 for some in (loops, rows)]
-    odds += np.log(places[0] / places[1] / count) - motion.log_density(steps_of(growth, steps))
+    true, refused = len(np.unique(given.place[loops])) + 1, len(rows) + 1
+    odds += np.log(true / refused / count) - motion.log_density(steps_of(growth, steps))
     likeliest, all_of_them = int(np.argmax(odds)), float(np.logaddexp.reduce(odds))
     return {int(steps[likeliest]): all_of_them} if np.isfinite(all_of_them) else {}
 
