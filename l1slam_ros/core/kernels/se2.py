@@ -64,6 +64,12 @@ def _seen(x_i, x_j, c, s):
     return c * dx + s * dy, c * dy - s * dx
 
 
+@compiled
+def _turn_between(c_i, s_i, c_j, s_j):
+    """Return cosine and sine of the angle from i to j, of which the cosine and sine are known."""
+    return c_i * c_j + s_i * s_j, c_i * s_j - s_i * c_j
+
+
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1])')
 def residual(z, x_i, x_j):
     """Return e (m, 3), its angle not yet wrapped."""
@@ -94,8 +100,8 @@ def jacobians(z, x_i, x_j):
         J_i[f, 0, 0], J_i[f, 0, 1], J_i[f, 0, 2] = -c, -s, c * ty - s * tx
         J_i[f, 1, 0], J_i[f, 1, 1], J_i[f, 1, 2] = s, -c, -s * ty - c * tx
         J_i[f, 2, 2] = -1.0
-        c_ij, s_ij = c_i[f] * c_j[f] + s_i[f] * s_j[f], c_i[f] * s_j[f] - s_i[f] * c_j[f]
-        c_phi, s_phi = c * c_ij + s * s_ij, c * s_ij - s * c_ij
+        c_ij, s_ij = _turn_between(c_i[f], s_i[f], c_j[f], s_j[f])
+        c_phi, s_phi = _turn_between(c, s, c_ij, s_ij)
         J_j[f, 0, 0], J_j[f, 0, 1] = c_phi, -s_phi
         J_j[f, 1, 0], J_j[f, 1, 1] = s_phi, c_phi
         J_j[f, 2, 2] = 1.0
@@ -114,7 +120,7 @@ def curvature(z, x_i, x_j, dual):
         t = _seen(x_i[f], x_j[f], c_i[f], s_i[f])
         c, s = c_z[f], s_z[f]
         mx, my = c * dual[f, 0] - s * dual[f, 1], s * dual[f, 0] + c * dual[f, 1]
-        c, s = c_i[f] * c_j[f] + s_i[f] * s_j[f], c_i[f] * s_j[f] - s_i[f] * c_j[f]
+        c, s = _turn_between(c_i[f], s_i[f], c_j[f], s_j[f])
         of_i = H[f, 0, 0]
         of_i[0], of_i[1] = my, -mx
         of_i[2] = -(mx * t[0] + my * t[1])

@@ -24,6 +24,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.linear_system import with_world
+from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.innovation import claimed_volume, log_claims, log_likelihood_ratio
 from l1slam_ros.core.robust.rounds.growth import Growth
@@ -75,10 +76,11 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     return Group(found, np.unique(growth.given.place[found]))
 
 
-def most_places_across(growth: Growth) -> int:
-    """Return of how many places loops agree how two parts lie to each other, at most."""
-    return max((len(strongest_group(growth, rows).places)
-                for rows in by_pair_of_parts(growth, growth.joining())), default=0)
+def strongest_across(growth: Growth) -> Group:
+    """Return the group of most places that agrees how two parts lie to each other, or none."""
+    return max((strongest_group(growth, rows)
+                for rows in by_pair_of_parts(growth, growth.joining())),
+               key=lambda group: len(group.places), default=NO_GROUP)
 
 
 def longest_run(growth: Growth, rows: Indices) -> Group:
@@ -231,8 +233,8 @@ def _least(values: Array, count: int) -> Indices:
 def by_pair_of_parts(growth: Growth, rows: Indices) -> list[Indices]:
     """Return some loops from one part to another by the two parts that they join, (k,) each."""
     given = growth.given
-    parts = growth.part[np.stack((given.low[rows], given.high[rows]))]
-    pair = np.sort(parts, axis=0).T @ np.array([given.graph.n_poses, 1])
+    pair = pair_key(growth.part[given.low[rows]], growth.part[given.high[rows]],
+                    given.graph.n_poses)
     return [rows[pair == one] for one in np.unique(pair)]
 
 

@@ -90,9 +90,9 @@ class FactorTable:
 
     def judgement(self, of_all: Judgement) -> Judgement:
         """Return the rows as a judgement; of_all : the last one, for values that have no rows."""
-        rows = self.rows.view(_WHOLE)[~np.isnan(self.rows['noise'])].view(ROW)
-        return replace(of_all, accepted=rows['accepted'], suspect=rows['suspect'],
-                       sigmas=rows['sigmas'], noise=rows['noise'])
+        rows, judged = self.rows, ~np.isnan(self.rows['noise'])
+        return replace(of_all, accepted=rows['accepted'][judged], suspect=rows['suspect'][judged],
+                       sigmas=rows['sigmas'][judged], noise=rows['noise'][judged])
 
     def behind(self, judgement: Judgement) -> Judgement:
         """Return a judgement of the first factors, extended by the rows of the later ones."""

@@ -39,8 +39,8 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     Group,
     by_pair_of_parts,
     longest_run,
-    most_places_across,
     spanned,
+    strongest_across,
     strongest_group,
 )
 from l1slam_ros.core.robust.rounds.evidence import FEWEST_PLACES, TWO_PLACES
@@ -62,8 +62,7 @@ def join(growth: Growth, by_runs: bool = False) -> bool:
     """
     joined = False
     while (rows := growth.joining()).size:
-        group = max((strongest_group(growth, some) for some in by_pair_of_parts(growth, rows)),
-                    key=lambda group: len(group.places))
+        group = strongest_across(growth)
         if len(group.places) < TWO_PLACES and by_runs:
             group = max((longest_run(growth, some) for some in by_pair_of_parts(growth, rows)),
                         key=lambda group: len(group.rows))
@@ -123,14 +122,18 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
                 state.put_back = dict.fromkeys(steps, (odds, state.accepted.copy()))
     found = found or with_runs(growth)
     if not found:
-        # In the end more is known than when it was cut.
-        now = log_odds_of_slips(growth, motion) if growth.cut.any() else np.zeros(0)
-        growth.slip_odds |= {step: max(odds, float(now[step]))
-                             for step, odds in growth.slip_odds.items() if growth.cut[step]}
-        untold = untold_slip(as_stated, motion)
-        growth.slip_odds |= {step: max(odds, growth.slip_odds.get(step, odds))
-                             for step, odds in untold.items() if odds > LEAST}
+        growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion)
     return found
+
+
+def _odds_in_the_end(growth: Growth, as_stated: Growth, motion: Motion) -> dict[int, float]:
+    """Return ln of the odds to have slipped of steps that are cut, or of which no loop tells."""
+    last = {step: odds for step, odds in untold_slip(as_stated, motion).items() if odds > LEAST}
+    if growth.cut.any():
+        # More is known than when it was cut.
+        now = log_odds_of_slips(growth, motion)
+        last |= {step: float(now[step]) for step in growth.slip_odds if growth.cut[step]}
+    return {step: max(odds, growth.slip_odds.get(step, odds)) for step, odds in last.items()}
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
@@ -184,7 +187,8 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
         if len(common):
             suspects.append(int(common[np.argmax(odds[common])]))
         left_out = np.setdiff1d(left_out, group.rows)
-    return [step for step in dict.fromkeys(suspects) if step not in growth.standing]
+    standing = growth.standing
+    return [step for step in dict.fromkeys(suspects) if step not in standing]
 
 
 def common_steps(growth: Growth, rows: Indices) -> Indices:
@@ -203,7 +207,7 @@ def _without(growth: Growth, step: int) -> Growth | None:
     state.drops[:] = 0
     if not (state.accepted & span).any():  # each side stays as it is
         state.label_parts()
-        if most_places_across(state) < TWO_PLACES:
+        if len(strongest_across(state).places) < TWO_PLACES:
             return None
     state.accepted[span] = state.given.trusted[span]
     state.solve()
@@ -291,7 +295,9 @@ def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
     """
     given = state.given
     manifold, chain = given.graph.manifold, given.chain
-    measured, row, count = state.uncut(), np.array([cut]), len(steps)
+    measured = state.uncut()
+    row = np.array([cut])
+    count = len(steps)
     root, spread = unwhitening(measured, row), measured.innovations(row).spread
     low, high = given.low[row], given.high[row]
     moved = manifold.between(state.poses[low], state.poses[high])

@@ -63,15 +63,17 @@ def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
             more = _log_density(growth, motion, steps[own], row, known)
             odds[own] = np.logaddexp(odds[own], more)
     true, refused = len(np.unique(given.place[loops])) + 1, len(rows) + 1
+    manifold = given.graph.manifold
     odds += np.log(true / refused / count) - motion.log_density(steps_of(growth, steps))
-    likeliest, all_of_them = int(np.argmax(odds)), float(np.logaddexp.reduce(odds))
-    return {int(steps[likeliest]): all_of_them} if np.isfinite(all_of_them) else {}
+    odds += claimed_volume(manifold, growth.poses)[manifold.TRANSLATION].sum()
+    all_of_them = float(np.logaddexp.reduce(odds))
+    return {int(steps[np.argmax(odds)]): all_of_them} if np.isfinite(all_of_them) else {}
 
 
 def _log_density(growth: Growth, motion: Motion, steps: Indices, row: int,
                  known: Array) -> Array:
     """
-    Return ln p(y as motion) p_slip(z | y) V of steps z that a loop spans, (k,).
+    Return ln p(y as motion) p_slip(z | y) of steps z that a loop spans, (k,).
 
     known : (d, d) the covariance of the loop, predicted without it
     """
@@ -89,8 +91,7 @@ def _log_density(growth: Growth, motion: Motion, steps: Indices, row: int,
     J = manifold.local_jacobian(start, y)
     moved = motion.log_density(manifold.local(start, y), J @ spread @ J.transpose(0, 2, 1))
     slip = manifold.local(y, given.factors.measurement[steps])
-    return moved + _log_slip(manifold, slip, spread, motion) + claimed_volume(
-        manifold, poses)[manifold.TRANSLATION].sum()
+    return moved + _log_slip(manifold, slip, spread, motion)
 
 
 def _log_slip(manifold: Manifold, slip: Array, spread: Array, motion: Motion) -> Array:
