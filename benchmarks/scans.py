@@ -52,7 +52,9 @@ from l1slam_ros.io.trajectory import read_reference
 # [m], [rad]
 FAR, TURNED = 0.5, 0.1
 # [m]
-SIDE, NEAR, APART = 2.0, 2.0, 10.0
+SIDE = 2.0
+NEAR = 2.0
+APART = 10.0
 # [ns] So near to a corrected pose a scan tells the error of a variant, which may have few.
 NEAR_SCAN = 10**8
 
@@ -66,7 +68,9 @@ class Timed:
     def __enter__(self) -> 'Timed':
         """Measure every front end."""
         self._add, self._loops = ScanFrontEnd.add, ScanFrontEnd.loops
-        add, loops, seconds = self._add, self._loops, self.seconds
+        add = self._add
+        loops = self._loops
+        seconds = self.seconds
 
         def timed_add(front_end: ScanFrontEnd, *arguments: object) -> object:
             began = time.thread_time()

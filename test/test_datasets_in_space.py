@@ -27,7 +27,9 @@ from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 
-SPHERE, GARAGE, GRID = 'sphere2500', 'parking-garage', 'real/smallGrid3D'
+SPHERE = 'sphere2500'
+GARAGE = 'parking-garage'
+GRID = 'real/smallGrid3D'
 
 
 @cache

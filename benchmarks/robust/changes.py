@@ -91,7 +91,9 @@ def _slip(place: Place, rng: np.random.Generator, what: str, count: int) -> Chan
     What they measured is gone, so the map to be found is that of all the others, which leave no
     part on its own.
     """
-    graph, manifold, factors = place.graph, place.graph.manifold, place.graph.between
+    graph = place.graph
+    manifold = place.graph.manifold
+    factors = place.graph.between
     steps = np.flatnonzero(factors.is_odometry)
     edge = int(len(steps) * _EDGE)
     others = FactorGraph(manifold)

@@ -84,7 +84,9 @@ def laps(rng: Rng) -> Place:
 def spokes(rng: Rng) -> Place:
     """Return a way out and back along several arms, with loops on these and where they meet."""
     arms, length = int(rng.integers(3, 7)), int(rng.integers(25, 70))
-    way, hubs, pairs = [np.zeros((1, 2))], [0], []
+    way = [np.zeros((1, 2))]
+    hubs = [0]
+    pairs = []
     for arm in range(arms):
         heading, s = 2 * np.pi * arm / arms + rng.normal(0, 0.1), np.arange(1, length + 1)
         ahead = np.array([np.cos(heading), np.sin(heading)])

@@ -25,7 +25,11 @@ from dataclasses import dataclass, replace
 
 # What being doubtful does to a run: it fails; nothing; it excuses a map that is off and true
 # loops that are lost; it excuses false loops that are kept, too; only with it does it pass.
-NEVER, FREE, EXCUSES_LOST, EXCUSES, MUST = 'never', 'free', 'excuses lost', 'excuses', 'must'
+NEVER = 'never'
+FREE = 'free'
+EXCUSES_LOST = 'excuses lost'
+EXCUSES = 'excuses'
+MUST = 'must'
 UNBOUNDED = float('inf')
 # As an error: no more than that of the odometry.
 ODOMETRY = 'odometry'

@@ -185,7 +185,9 @@ def run_of(case: FalseCase, solver: RobustSolver, limit: float) -> Run:
 def judged(name: tuple[str, str, str, float, int, str], case: FalseCase, found: Found,
            error: float) -> Run:
     """Return the run, by the counts of its loops and the bar of the case."""
-    graph, bar, judges = case.graph, case.bar, found.accepted is not None
+    graph = case.graph
+    bar = case.bar
+    judges = found.accepted is not None
     accepted = fitting(graph, found.poses) if found.accepted is None else found.accepted
     kept, lost = ((accepted & case.is_false).sum(), (~accepted & case.is_true).sum())
     wrongly = len(set(found.slips) - set(case.slips.tolist()))

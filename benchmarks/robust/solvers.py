@@ -108,7 +108,10 @@ def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
     """
 
     def solve(graph: FactorGraph, poses: Array) -> Found:
-        maps, seconds, process, began = [], 0.0, clock(), time.monotonic()
+        maps = []
+        seconds = 0.0
+        process = clock()
+        began = time.monotonic()
         nothing = dict.fromkeys(('translation', 'rotation', 'period'), 0.0)
         options = BackendOptions.from_mapping(
             {'keyframe': nothing, 'odometry': {'covariance_source': 'increment'}})

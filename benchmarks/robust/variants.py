@@ -116,7 +116,9 @@ def _repeated(place: Place, times: int) -> Place:
 
 def _drifting(place: Place, turn: float, stretch: float) -> Place:
     """Let the odometry turn so much more on each metre [rad], and stretch it."""
-    graph, manifold, factors = place.graph, place.graph.manifold, place.graph.between
+    graph = place.graph
+    manifold = place.graph.manifold
+    factors = place.graph.between
     Z, odometry = factors.measurement.copy(), factors.is_odometry
     way = Z[odometry]
     way[:, manifold.TRANSLATION] *= stretch
@@ -134,13 +136,19 @@ def _corridor(place: Place, part: float, times: float) -> Place:
 
     times : what the noise of all is said to be, in units of what it was said to be
     """
-    graph, manifold, factors = place.graph, place.graph.manifold, place.graph.between
-    rng, m, n = np.random.default_rng(0), len(factors), graph.n_poses
+    graph = place.graph
+    manifold = place.graph.manifold
+    factors = place.graph.between
+    rng = np.random.default_rng(0)
+    m = len(factors)
+    n = graph.n_poses
     told = pair_key(factors.i, factors.j, n)
     loops = np.flatnonzero(~factors.is_odometry & (np.maximum(factors.i, factors.j) < n - 3)
                            & ~np.isin(pair_key(factors.i + 2, factors.j + 3, n), told))
     rows = rng.choice(loops, round(part * len(loops)), replace=False)
-    i, j, count = factors.i[rows] + 2, factors.j[rows] + 3, len(rows)
+    i = factors.i[rows] + 2
+    j = factors.j[rows] + 3
+    count = len(rows)
     along = np.zeros((count, manifold.TANGENT_SIZE))
     along[:, 0] = rng.choice([-1, 1], count) * rng.uniform(1.0, 5.0, count)
     Z = manifold.retract(manifold.between(place.best[i], place.best[j]), along)

@@ -51,7 +51,11 @@ _POINTS = 72 / _DOTS  # of type, in a dot
 _LIST = 0.25  # of RViz's window
 _SMALL = 9  # [points]
 # What RViz draws by default: arrows and axes [m], the line of a Path [dots].
-_SHAFT, _THICK, _HEAD, _AXIS, _HAIR = 1.0, 0.1, 0.3, 1.0, 1.0
+_SHAFT = 1.0
+_THICK = 0.1
+_HEAD = 0.3
+_AXIS = 1.0
+_HAIR = 1.0
 _XYZ = 'red', 'limegreen'
 _GREY = (160 / 255, 160 / 255, 164 / 255, 0.5)
 

@@ -44,7 +44,9 @@ from l1slam_ros.ros.shell.header import header
 
 SECONDS, PATTERNS = 40.0, '5,10,20,50,10j'
 _LISTENERS = 2  # the node, and who looks up
-_JITTER, _SPEED, _RADIUS = 0.5, 1.0, 3.0  # [1], [m/s], [m]
+_JITTER = 0.5
+_SPEED = 1.0  # [m/s]
+_RADIUS = 3.0  # [m]
 _LAP = 2 * math.pi * _RADIUS / _SPEED  # [s]
 
 

@@ -44,7 +44,9 @@ from l1slam_ros.ros.demo import executable
 
 RATE = 400.0
 _BAG_RATE = 10.0  # keyframes a second, where a graph has no stamps
-_AFTER, _AT_REST, _IDLE = 5.0, 20.0, 20.0  # [s]
+_AFTER = 5.0  # [s]
+_AT_REST = 20.0  # [s]
+_IDLE = 20.0  # [s]
 # As the note says that the conversion leaves in the bag.
 _AS_RECORDED = {'keyframe.translation': 0.0, 'keyframe.rotation': 0.0,
                 'odometry.covariance_source': 'increment', 'autosave_period': 0.0}

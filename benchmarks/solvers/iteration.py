@@ -88,7 +88,9 @@ def _needed(size: float | None, edges: int, bandwidths: list[float]) -> dict[str
 
 def bandwidth(triad: Callable[..., None], elements: int) -> float:
     """Return how many bytes a second a triad over three arrays moves [B/s]."""
-    a, b, c = np.zeros(elements), np.ones(elements), np.ones(elements)
+    a = np.zeros(elements)
+    b = np.ones(elements)
+    c = np.ones(elements)
     triad(a, b, c, 0.5, 1)
     count = 1
     while True:

@@ -54,8 +54,12 @@ def clarabel_solution(problem: InnerProblem, form: str, tolerance: float,
         q, h = np.concatenate((np.zeros(n), np.ones(m))), np.concatenate((b, -b))
         cones = [clarabel.NonnegativeConeT(2 * m)]
     settings = clarabel.DefaultSettings()
-    settings.verbose, settings.max_threads, settings.time_limit = False, 1, limit
-    settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = 0.0, tolerance, tolerance
+    settings.verbose = False
+    settings.max_threads = 1
+    settings.time_limit = limit
+    settings.tol_gap_abs = 0.0
+    settings.tol_gap_rel = tolerance
+    settings.tol_feas = tolerance
     arguments = sp.csc_matrix((len(q), len(q))), q, sp.csc_matrix(G), h, cones, settings
     found: list[Any] = []
 
@@ -85,7 +89,9 @@ def _highs(problem: InnerProblem, setting: Setting, limit: float) -> Answer:
     transpose = sp.csc_matrix(A.T)
     model = highspy.HighsLp()
     model.num_col_, model.num_row_ = m, n
-    model.col_cost_, model.col_lower_, model.col_upper_ = b, -np.ones(m), np.ones(m)
+    model.col_cost_ = b
+    model.col_lower_ = -np.ones(m)
+    model.col_upper_ = np.ones(m)
     model.row_lower_, model.row_upper_ = np.zeros(n), np.zeros(n)
     model.a_matrix_.format_ = highspy.MatrixFormat.kColwise
     model.a_matrix_.start_ = transpose.indptr

@@ -20,14 +20,25 @@ NOTHING = '–'
 YOUNG = 1300
 # Bars, in the order of the table below: of ISAM2's p99, longest update and sum of updates, of that
 # sum all that ours takes in all threads; [ms] the p95 of the last quarter.
-CITY_P99, CITY_MAX, CITY_TOTAL, CITY_ALL, CITY_LAST = 1 / 4, 1 / 4, 1 / 3, 1.0, 5.0
+CITY_P99 = 1 / 4
+CITY_MAX = 1 / 4
+CITY_TOTAL = 1 / 3
+CITY_ALL = 1.0
+CITY_LAST = 5.0
 # Excess [%]: mean, most, a second after the end. Error over that of the map of all true loops, and
 # three times that plus [m] where there are lies.
-EXCESS, EXCESS_MOST, EXCESS_AT_REST, ERROR, ERROR_TIMES, ERROR_PLUS = 0.5, 2.0, 0.1, 1.05, 3.0, 0.5
+EXCESS = 0.5
+EXCESS_MOST = 2.0
+EXCESS_AT_REST = 0.1
+ERROR = 1.05
+ERROR_TIMES = 3.0
+ERROR_PLUS = 0.5
 # Recorded lies: over the error of the batch in the end, and [m] above the odometry on the way.
 RECORDED_ERROR, WORSE = 1.1, 1.0
 # A large sparse world: p99 [ms], memory [MiB].
-LARGE, LARGE_P99, LARGE_MEMORY = 'world50k', 20.0, 1024.0
+LARGE = 'world50k'
+LARGE_P99 = 20.0
+LARGE_MEMORY = 1024.0
 
 
 def document(recorded: Mapping[str, Any], rows: Sequence[Row]) -> list[str]:

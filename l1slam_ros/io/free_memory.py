@@ -27,7 +27,9 @@ _LIMITS = (('memory.max', 'memory.current', 'inactive_file'),
 # Settings of glibc's mallopt: how many arrays may be memory of their own; the size from which one
 # is; and from how many bytes on what is free at the end is given back. By default glibc raises the
 # last two, to tens of megabytes a thread.
-_MMAP_MAX, _MMAP_THRESHOLD, _TRIM_THRESHOLD = -4, -3, -1
+_MMAP_MAX = -4
+_MMAP_THRESHOLD = -3
+_TRIM_THRESHOLD = -1
 _KEPT = 2**30
 # [bytes] From this size on NumPy asks for huge pages: fresh ones cost as little as reused ones.
 _HUGE = 2**22

@@ -27,7 +27,9 @@ def rotation(k, rng):
 @pytest.mark.parametrize('k', [2, 3])
 def test_a_rigid_motion_is_found(k, rng):
     for _ in range(20):
-        estimate, R, t = rng.normal(size=(30, k)), rotation(k, rng), 100 * rng.normal(size=k)
+        estimate = rng.normal(size=(30, k))
+        R = rotation(k, rng)
+        t = 100 * rng.normal(size=k)
         truth = estimate @ R.T + t
         found_R, found_t = align(estimate, truth)
         np.testing.assert_allclose(found_R, R, atol=1e-12)

@@ -16,7 +16,9 @@ from problems import add_absolute, drive, graph_of
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.world_frame import placed
 
-WHOLE, POSITION, HEADING = np.eye(3), np.diag([1.0, 1, 0]), np.diag([0, 0, 1.0])
+WHOLE = np.eye(3)
+POSITION = np.diag([1.0, 1, 0])
+HEADING = np.diag([0, 0, 1.0])
 
 
 def moved(poses, motion):

@@ -125,7 +125,9 @@ def test_what_new_neighbours_do_not_touch_stays(rng):
     """As a map grows: nodes come, and neighbours of old ones; the columns are exact, few more."""
     pairs = np.array(planar(400, rng))
     rng.shuffle(pairs)
-    found, begun, stayed = NOTHING, NOTHING, []
+    found = NOTHING
+    begun = NOTHING
+    stayed = []
     for n in range(300, 401, 10):
         known = pairs[:-(400 - n) // 10 or None]
         graph = adjacency_of(known.tolist(), n)

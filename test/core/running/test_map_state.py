@@ -24,7 +24,9 @@ from l1slam_ros.core.running.map_state import Carried, MapState
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.solvers.optimality import Status
 
-FITS, CHANCE, LIE = Look(True, False, 0.5), Look(False, True, 1.0), Look(False, False, 9.0)
+FITS = Look(True, False, 0.5)
+CHANCE = Look(False, True, 1.0)
+LIE = Look(False, False, 9.0)
 POSES = se2.identity(5)
 
 

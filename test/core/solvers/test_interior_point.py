@@ -176,7 +176,9 @@ def test_the_step_solves_the_newton_equations(rows, rng):
 
 def test_a_step_is_taken_and_slacks_stay_positive(rows):
     _, (u, v, s, t), y, *_ = rows
-    dy, du, dv = np.where(y > 0, 9.0, -9.0), u.copy(), v.copy()
+    dy = np.where(y > 0, 9.0, -9.0)
+    du = u.copy()
+    dv = v.copy()
     at = _Iterate(np.zeros(0), None, u, v, s, t, y)
     best = replace(at)
     at.advance(_Direction(np.zeros(0), np.zeros(50), dy, du, dv, 1.0, 0.2, 0.0), 0.3)

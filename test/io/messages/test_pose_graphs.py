@@ -41,8 +41,14 @@ FIELDS = {name: fields for key, text in DEFINITIONS.items()
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 TYPES.register(FIELDS)
 M = TYPES.types
-NEIGHBOUR, GLOBAL, VIRTUAL, PRIOR, LANDMARK = 0, 1, 5, 7, 8
-ODOM, LOOPCLOSE, REJECTED = 0, 1, 3
+NEIGHBOUR = 0
+GLOBAL = 1
+VIRTUAL = 5
+PRIOR = 7
+LANDMARK = 8
+ODOM = 0
+LOOPCLOSE = 1
+REJECTED = 3
 SIGMA = np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03])
 COVARIANCE = np.diag(SIGMA**2)
 

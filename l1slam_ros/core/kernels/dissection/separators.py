@@ -30,7 +30,9 @@ _PASSES, _HOPE = 3, 100
 # No side may be a larger share of what is cut. Of a sphere it pays to cut off a cap.
 _MOST = 0.72
 # The sides of a cut, and what is between.
-_LEFT, _RIGHT, _BETWEEN = 0, 1, 2
+_LEFT = 0
+_RIGHT = 1
+_BETWEEN = 2
 
 
 @loop('(' + POOL + ', i8, i8, f8, i4[:, ::1], ' + SPACE + ')')

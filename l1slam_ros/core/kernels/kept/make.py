@@ -17,7 +17,9 @@ from numba.np import numpy_support
 from l1slam_ros.core.kernels.kept import objects
 
 # Of an object file in ELF, 64 bits, little-endian: a section, a symbol.
-_HEAD, _SECTION, _SYMBOL = '<16sHHIQQQIHHHHHH', '<IIQQQQIIQQ', '<IBBHQQ'
+_HEAD = '<16sHHIQQQIHHHHHH'
+_SECTION = '<IIQQQQIIQQ'
+_SYMBOL = '<IBBHQQ'
 _SYMBOLS = 2  # type of the section with the symbols
 
 
