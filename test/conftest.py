@@ -9,6 +9,7 @@
 """Fixtures every test may ask for."""
 
 import os
+import signal
 import subprocess
 from contextlib import suppress
 from pathlib import Path
@@ -106,7 +107,9 @@ def start():
         processes.append(subprocess.Popen(
             ['sh', '-c', f'{first} exec "$@"', 'sh', executable('backend'), *arguments],
             stderr=subprocess.PIPE, text=True, start_new_session=True,
-            env={**os.environ, **environment}))
+            env={**os.environ, **environment},
+            # Under `nohup` the tests ignore it, and so would the node.
+            preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)))
         return processes[-1]
 
     yield begin

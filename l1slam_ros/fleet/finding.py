@@ -67,7 +67,7 @@ def find(folder: Path, output: Path) -> list[Recording]:
 
     Raises
     ------
-    FileError : it is no folder, is a bag itself, or holds no recording.
+    FileError : it is no folder, is a bag itself, is the output, or holds no recording.
 
     """
     if not folder.is_dir():
@@ -76,6 +76,8 @@ def find(folder: Path, output: Path) -> list[Recording]:
         raise FileError(folder, 'is one recording; expected a folder of recordings, or '
                         '`l1slam solve`')
     visited = {_identity(output)} if output.exists() else set()
+    if _identity(folder) in visited:
+        raise FileError(output, 'is the folder of the recordings; expected another folder')
     paths = sorted(_walk(folder, visited), key=lambda path: os.fsencode(path))
     if not paths:
         raise FileError(folder, f'no recording in it; expected {", ".join(_SUFFIXES)} or a '

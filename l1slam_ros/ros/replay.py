@@ -25,12 +25,12 @@ from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from l1slam_ros.core.errors import FileError, L1SlamError, OptionError
 from l1slam_ros.io.bags.damaged.walk import BagMessage
-from l1slam_ros.io.bags.reader import BagSummary, bag_summary, read_raw
+from l1slam_ros.io.bags.reader import BagSummary, TopicSummary, bag_summary, read_raw
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.progress import Progress, say
 from l1slam_ros.ros.shell.arguments import split
@@ -83,8 +83,7 @@ class Player:
             try:
                 if kind is None:
                     raise OptionError(f'the type {topic.msgtype} is not installed')
-                self.publishers[topic.name] = node.create_publisher(
-                    kind, name, QoSProfile(depth=_DEPTH))
+                self.publishers[topic.name] = node.create_publisher(kind, name, _profile(topic))
             except Exception as error:  # of names, and of two types of one, rclpy raises anything
                 why = f'{topic.name} cannot be played onto {name}: {reason(error)}'
                 if topics is not None or topic.name in remap:
@@ -164,6 +163,15 @@ class Player:
         moment = Duration(seconds=_PAUSE)
         while not all(p.wait_for_all_acked(moment) for p in self.publishers.values()):
             _sleep_until(time.monotonic())  # an interrupt is seen between the waits
+
+
+def _profile(topic: TopicSummary) -> QoSProfile:
+    """Return how a topic is published: what was kept for who comes late is kept here, too."""
+    # Transforms that stay are sent by many publishers, each keeping its own.
+    kept = _DEPTH if topic.name.endswith('/tf_static') else min(topic.kept, _DEPTH)
+    if kept:
+        return QoSProfile(depth=kept, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    return QoSProfile(depth=_DEPTH)
 
 
 def _sleep_until(moment: float) -> None:

@@ -144,13 +144,13 @@ class MapServices:
         again = 0.0
         while not self._ending.wait(_LOOK):
             if self._map_file.is_due() and (began := time.monotonic()) >= again:
-                self._autosave()
+                self._autosave(periodic=True)
                 again = 2 * time.monotonic() - began  # at most half of the time is spent saving
         self._autosave()
 
-    def _autosave(self, taken: Callable[[], None] = lambda: None) -> str:
+    def _autosave(self, taken: Callable[[], None] = lambda: None, periodic: bool = False) -> str:
         try:
-            self._map_file.autosave(taken)
+            self._map_file.autosave(taken, periodic)
         except Exception as error:
             self._failures.note('autosave', error)
         else:

@@ -8,7 +8,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """From scans that mislead to a map: it is right, or it is said that it may not be."""
 
+import contextlib
+import io
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -110,19 +113,28 @@ CASES = {
     'carried elsewhere': carried_elsewhere, 'upside down': upside_down}
 
 
-def solved(case, folder, capsys):
-    """Return the exit code of `solve`, and what it says."""
-    true, scans, wheels = CASES[case]()
-    write_scan_bag(folder / 'bag', scans, wheels, mount=((0.0, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0)))
-    write_truth(folder / 'truth.csv', scans, true)
-    code = main(['solve', str(folder / 'bag'), '--scans', '/scan', '--odom-topic', '/wheels',
-                 '--reference', str(folder / 'truth.csv'), '--json'])
-    return code, json.loads(capsys.readouterr().out)
+@pytest.fixture(scope='module')
+def solved(tmp_path_factory):
+    """Return what gives the exit code of `solve`, and what it says; each case is solved once."""
+    @cache
+    def solve(case):
+        folder = tmp_path_factory.mktemp('case')
+        true, scans, wheels = CASES[case]()
+        write_scan_bag(folder / 'bag', scans, wheels,
+                       mount=((0.0, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0)))
+        write_truth(folder / 'truth.csv', scans, true)
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            code = main(['solve', str(folder / 'bag'), '--scans', '/scan', '--odom-topic',
+                         '/wheels', '--reference', str(folder / 'truth.csv'), '--json'])
+        return code, json.loads(printed.getvalue())
+
+    return solve
 
 
 @pytest.mark.parametrize('case', CASES)
-def test_no_wrong_map_in_silence(case, tmp_path, capsys):
-    code, said = solved(case, tmp_path, capsys)
+def test_no_wrong_map_in_silence(case, solved):
+    code, said = solved(case)
     assert said['ate'] < 0.1 or (code == 4 and said['status'] == 'doubtful'), said
     # That scans turn against the wheels is said where they do, and nowhere else.
     hangs = any(' is the laser upside down? ' in sentence for sentence in said['warnings'])
@@ -130,13 +142,13 @@ def test_no_wrong_map_in_silence(case, tmp_path, capsys):
 
 
 @pytest.mark.parametrize('case', list(CASES)[:4])
-def test_what_is_hard_to_see_does_not_spoil_the_map(case, tmp_path, capsys):
-    code, said = solved(case, tmp_path, capsys)
+def test_what_is_hard_to_see_does_not_spoil_the_map(case, solved):
+    code, said = solved(case)
     assert code == 0 and said['ate'] < 0.1 and said['loops'] - len(said['rejected']) >= 3
 
 
-def test_a_drive_in_parts_that_nothing_joins_is_doubtful(tmp_path, capsys):
-    code, said = solved('carried elsewhere', tmp_path, capsys)
+def test_a_drive_in_parts_that_nothing_joins_is_doubtful(solved):
+    code, said = solved('carried elsewhere')
     assert code == 4 and said['parts'] == 2
     assert [doubt['kind'] for doubt in said['doubts']] == ['parts']
     assert ' joins 2 parts of the map, between ' in said['warnings'][-1]

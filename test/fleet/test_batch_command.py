@@ -199,6 +199,8 @@ def test_nothing_of_others_is_replaced(recordings, done, tmp_path, capsys):
     assert 'no such file' in run(
         capsys, 'batch', recordings, '--output', output, '--resume', code=2)[1]
     assert [path.name for path in output.iterdir()] == ['mine']
+    assert 'is the folder of the recordings' in run(
+        capsys, 'batch', recordings, '--output', recordings, code=2)[1]
     assert 'expected --resume' in run(capsys, 'batch', recordings, '--output', done[0], code=2)[1]
     copy = tmp_path / 'copy'
     shutil.copytree(done[0], copy)

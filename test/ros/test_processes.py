@@ -27,8 +27,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
 from bags import write_world
-from l1slam_ros.io.bags.reader import read_raw
+from l1slam_ros.io.bags.reader import BagSummary, TopicSummary, read_raw
 from l1slam_ros.ros.demo import executable
+from l1slam_ros.ros.replay import Player
 
 DEADLINE = 300.0  # [s] the solver can have to be compiled first
 
@@ -214,6 +215,21 @@ def test_replay_of_a_damaged_bag_plays_a_part_says_so_and_exits_with_3(backend, 
     assert re.fullmatch(rf'replay: {file} is damaged: it breaks off after [0-9,]+ bytes; '
                         '[0-9,]+ messages before that were used', complaint)
     paths(lambda path: len(path.poses) == odometry)
+
+
+def test_what_was_kept_for_who_comes_late_is_kept_by_replay(ros):
+    """Who asks for what was kept, as for a grid, hears no publisher that keeps nothing."""
+    kind = 'std_msgs/msg/String'
+    topics = [TopicSummary('/grid', kind, 1, kept=1), TopicSummary('/r1/tf_static', kind, 2),
+              TopicSummary('/said', kind, 9)]
+    summary = BagSummary(tuple(topics), start=0, duration=0, note={})
+    node = ros.create_node('replay')
+    player = Player(node, summary, None, {}, clock=False)
+    profiles = {name: publisher.qos_profile for name, publisher in player.publishers.items()}
+    kept = {name: profile.depth for name, profile in profiles.items()
+            if profile.durability is DurabilityPolicy.TRANSIENT_LOCAL}
+    assert kept == {'/grid': 1, '/r1/tf_static': 1000} and profiles['/said'].depth == 1000
+    node.destroy_node()
 
 
 def test_replay_of_a_topic_that_is_not_there_names_those_that_are(bag):

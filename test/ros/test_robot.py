@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far ahead transforms are stamped, and what look-ups find that are made at once."""
 
+import os
 import re
 import subprocess
 import sys
@@ -73,10 +74,12 @@ def test_the_tolerance_is_the_least_and_time_that_goes_back_begins_anew():
 
 def test_look_ups_made_at_once_are_answered():
     """On a busy machine; at rest `benchmarks/ros/lookups.py` finds next to none that are not."""
-    ran = subprocess.run([sys.executable, LOOKUPS, '5', '5,10j'], capture_output=True, text=True,
-                         timeout=300)
-    assert ran.returncode == 0, ran.stderr
-    found = re.findall(r'(\d+) look-ups, .* \((\d+)\)', ran.stdout)
-    assert len(found) == 2
-    for total, future in found:
-        assert int(total) > 20 and int(future) <= 0.05 * int(total), ran.stdout
+    # Each in a domain of its own: most of the time is waiting for messages.
+    variables = {name: value for name, value in os.environ.items() if name != 'ROS_DOMAIN_ID'}
+    patterns = [subprocess.Popen([sys.executable, LOOKUPS, '5', pattern], env=variables, text=True,
+                                 stdout=subprocess.PIPE) for pattern in ('5', '10j')]
+    for process in patterns:
+        said, _ = process.communicate(timeout=300)
+        assert process.returncode == 0
+        ((total, future),) = re.findall(r'(\d+) look-ups, .* \((\d+)\)', said)
+        assert int(total) > 20 and int(future) <= 0.05 * int(total), said

@@ -161,4 +161,10 @@ def test_two_laps_make_a_map(robot, tmp_path, rng, pose):
     assert r.front_end._front_end.run.counts['parts'] == 1
     saved = r.call('/scan_loops/save_map')
     assert saved.success and 'corridors.pgm' in saved.message
-    assert (tmp_path / 'corridors.yaml').exists()
+    assert r.call('/scan_loops/save_map').success, 'this one is ours'
+    mine = tmp_path / 'corridors.yaml'
+    mine.write_text(mine.read_text().split('\n', 1)[1].replace('0.65', '0.7'))
+    kept = mine.read_bytes(), (tmp_path / 'corridors.pgm').read_bytes()
+    refused = r.call('/scan_loops/save_map')
+    assert not refused.success and f'{mine}: was not written by l1slam_ros' in refused.message
+    assert kept == (mine.read_bytes(), (tmp_path / 'corridors.pgm').read_bytes())

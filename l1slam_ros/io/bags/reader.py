@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.errors import FileError, L1SlamError
@@ -55,11 +56,16 @@ def _refuse(damage: str) -> None:
 
 @dataclass(frozen=True)
 class TopicSummary:
-    """A topic, its type and its number of messages."""
+    """
+    A topic, its type and its number of messages.
+
+    kept : how many messages its publishers kept for subscribers that come late; 0: none.
+    """
 
     name: str
     msgtype: str
     count: int
+    kept: int = 0
 
 
 @dataclass(frozen=True)
@@ -130,17 +136,28 @@ def bag_summary(path: str | os.PathLike[str]) -> BagSummary:
     bag = _bag_path(path)
     try:
         with _reader(bag) as reader:
-            counts = [(name, topic.msgtype or 'several types', topic.msgcount)
+            counts = [(name, topic.msgtype or 'several types', topic.msgcount, _kept(topic))
                       for name, topic in reader.topics.items()]
             # Without messages the library's times are its largest and smallest numbers; its end
             # lies one nanosecond behind the last message.
             times = [reader.start_time, reader.end_time - 1] if reader.message_count else [0]
     except Exception as error:  # damaged bags make the library raise anything
         salvage = _salvage(bag, error)
-        counts = [(*names, count) for names, count in salvage.counts.items()]
+        counts = [(*names, count, 0) for names, count in salvage.counts.items()]
         times = salvage.times
     topics = tuple(TopicSummary(*entry) for entry in sorted(counts))
     return BagSummary(topics, min(times), max(times) - min(times), read_note(path))
+
+
+def _kept(topic: Any) -> int:
+    """Return how many messages of a topic were kept for subscribers that come late."""
+    kept = 0
+    for connection in topic.connections:
+        for profile in getattr(connection.ext, 'offered_qos_profiles', ()):
+            if profile.durability is QosDurability.TRANSIENT_LOCAL:
+                kept += max(profile.depth, 1)
+        kept += bool(getattr(connection.ext, 'latching', False))  # of ROS 1
+    return kept
 
 
 def read_note(path: str | os.PathLike[str]) -> dict[str, str]:

@@ -12,6 +12,7 @@ import filecmp
 import os
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -66,21 +67,28 @@ class MapFile:
         # Of the file before it: path and last bytes.
         self._ours: tuple[object, ...] = ()
         self._ours_before: tuple[object, ...] = ()
+        # How often a periodic save found that another program had replaced what this node wrote.
+        self._replaced: Counter[Path] = Counter()
 
     def save(self) -> str:
         """Save the map; return a sentence with its path, and the files that were renamed."""
         with self._at_work(), self._backend.calm:
             revision = self._backend.revisions.now
             path = self._path()
+            self._replaced.pop(path, None)
             saved = self._backend.saved()
             kept = self._keep_others(path, saved)
             return '; '.join([self._write(path, saved, revision), *kept])
 
-    def autosave(self, taken: Callable[[], None] = lambda: None) -> None:
+    def autosave(self, taken: Callable[[], None] = lambda: None, periodic: bool = False) -> None:
         """
         Save the map if it has changed; keep a file at its path that this node did not write.
 
+        Parameters
+        ----------
         taken : called when the map has been copied; it may be changed from then on
+        periodic : another save follows, so this one is refused where another program saves, too
+
         """
         with self._at_work():
             revision = self._backend.revisions.now
@@ -89,9 +97,26 @@ class MapFile:
             if saved is None:
                 return
             path = self._path()
+            if periodic:
+                self._require_alone(path)
             for sentence in self._keep_others(path, saved):
                 self._warn(sentence)
             self._write(path, saved, revision)
+
+    def _require_alone(self, path: Path) -> None:
+        """
+        Refuse a path where another program keeps replacing what this node saves.
+
+        Once may be a person, who copies a map there. Of two nodes each would keep the file of the
+        other in each period, until the disk is full.
+        """
+        end = _end_of(path)
+        if not end or self._ours[:1] != (path,) or self._ours[1] == end:
+            return
+        self._replaced[path] += 1
+        if self._replaced[path] > 1:
+            raise FileError(path, 'another program saves there, too; expected a save_path of its '
+                            'own. Until then only ~/save and the end of this node save')
 
     def _keep_others(self, path: Path, saved: SavedMap | None) -> list[str]:
         """Rename files that this node did not write; return a sentence for each."""

@@ -65,11 +65,12 @@ def assert_whole(laps, backend, least, missing):
     assert not (states == REJECTED).any() and (states == ACCEPTED).sum() > len(laps.loops) - 30
 
 
-@pytest.mark.parametrize('twist', [False, True], ids=['no twist', 'twist'])
 @pytest.mark.parametrize('silence', [0.05, 0.5, 2.0, 4.0])
 @pytest.mark.parametrize('where', [NEAR, ZERO, SAME], ids=['near', 'zero', 'same'])
 @pytest.mark.parametrize('when', TIMES)
-def test_odometry_that_restarts_bends_no_map(when, where, silence, twist):
+def test_odometry_that_restarts_bends_no_map(when, where, silence):
+    # Each two of these are tried with and without a twist.
+    twist = (list(TIMES).index(when) + (NEAR, ZERO, SAME).index(where) + int(2 * silence)) % 2 == 1
     laps, least = drive(twist)
     backend, refused = told(Backend(), laps, laps.restarted(TIMES[when], silence, where))
     assert_whole(laps, backend, least, silence)

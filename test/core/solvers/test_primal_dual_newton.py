@@ -98,7 +98,7 @@ def test_turned_frames_in_space(rng):
 @pytest.mark.parametrize('names', PURE + MIXED)
 def test_each_norm_ends_where_another_solver_does(names, manifold, rng):
     """SciPy's BFGS on the smoothed cost of a step from there finds nothing lower."""
-    graph, truth = noisy_graph(12, 10, rng) if manifold == 'plane' else space_graph(6, rng)
+    graph, truth = noisy_graph(8, 7, rng) if manifold == 'plane' else space_graph(5, rng)
     k, odometry = graph.manifold.TANGENT_SIZE, graph.between.is_odometry
     norm = norm_for(graph, *names, DELTA)
     found, _ = minimise_by(choose('auto', graph, *names), graph, truth, OPTIONS)

@@ -9,11 +9,24 @@
 """Bags in: messages, raw or decoded, in order of time; a summary, a note; what is no bag."""
 
 import pytest
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_typestore
 
-from bags import NOTED, STRING, write_strings
+from bags import NOTED, STRING, TYPES, write_strings
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note, read_raw
 from l1slam_ros.io.bags.writer import new_bag
+from l1slam_ros.io.messages.serialisation import cdr, string_bytes
 
 
 @pytest.fixture
@@ -43,6 +56,24 @@ def test_summary(bag):
         assert summary.start == 10 * 10**9
         assert summary.duration == 8 * 10**9
         assert summary.note == NOTED
+
+
+def test_summary_says_what_was_kept_for_who_comes_late(tmp_path):
+    time = QosTime(0, 0)
+    profiles = [Qos(QosHistory.KEEP_LAST, 3, QosReliability.RELIABLE, durability, time, time,
+                    QosLiveliness.AUTOMATIC, time, False)
+                for durability in (QosDurability.TRANSIENT_LOCAL, QosDurability.VOLATILE)]
+    with Rosbag2Writer(tmp_path / 'two', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for name, offered in (('/grid', profiles), ('/said', profiles[1:])):
+            to = writer.add_connection(name, STRING, typestore=TYPES, offered_qos_profiles=offered)
+            writer.write(to, 1, cdr((4, string_bytes('a'))))
+    for path in tmp_path / 'two', tmp_path / 'two' / 'two.mcap':
+        assert {t.name: t.kept for t in bag_summary(path).topics} == {'/grid': 3, '/said': 0}
+    with Rosbag1Writer(tmp_path / 'one.bag') as writer:
+        for latching in 0, 1:
+            writer.add_connection(f'/{latching}', STRING, typestore=get_typestore(
+                Stores.ROS1_NOETIC), latching=latching)
+    assert {t.name: t.kept for t in bag_summary(tmp_path / 'one.bag').topics} == {'/0': 0, '/1': 1}
 
 
 def test_an_empty_bag(tmp_path):

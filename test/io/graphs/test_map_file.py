@@ -57,7 +57,7 @@ class Robot:
         """Save where it is time, as the node does; return whether it was."""
         due = self.map_file.is_due()
         if due:
-            self.map_file.autosave()
+            self.map_file.autosave(periodic=True)
         return due
 
 
@@ -194,6 +194,35 @@ def test_what_is_not_its_own_any_more_is_kept(tmp_path, newer):
         assert robot.autosave()
     kept = [p for p in tmp_path.iterdir() if p.read_bytes() == content]
     assert len(kept) == 1 and robot.warnings[-1].endswith(f'it is kept as {kept[0]}')
+
+
+def test_two_who_save_to_one_path_do_not_fill_the_disk(tmp_path):
+    path, robots = tmp_path / 'map.g2o', [Robot(tmp_path / 'map.g2o') for _ in range(2)]
+    robots[1].seconds = 100
+    refused = []
+    for _ in range(20):
+        for robot in robots:
+            robot.drive(2)
+            try:
+                robot.autosave()
+            except FileError as error:
+                assert str(error).startswith(f'{path}: another program saves there, too; expected')
+                refused.append(robot)
+    # Alone, the other goes on.
+    assert len(refused) > 15 and len(set(refused)) == 1 and keyframes(path) == 40
+    assert len(list(tmp_path.iterdir())) < 10
+    # At its end each saves once more, and who asks for it is answered.
+    for robot in robots:
+        robot.map_file.autosave()
+    assert len({p.read_bytes() for p in tmp_path.iterdir() if keyframes(p) == 40}) == 2
+    (other,) = {*robots} - {*refused}
+    assert 'it is kept as' in other.map_file.save()
+    # Alone, or elsewhere, it saves as before.
+    other.drive(1)
+    assert other.autosave() and keyframes(path) == 41
+    stopped = refused[0]
+    stopped.options = replace(stopped.options, save_path=str(tmp_path / 'own.g2o'))
+    assert stopped.autosave() and keyframes(tmp_path / 'own.g2o') == 40
 
 
 def test_what_was_loaded_is_its_own(tmp_path):
