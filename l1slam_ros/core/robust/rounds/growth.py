@@ -100,7 +100,7 @@ class Growth:
                             repeated_factors(self.given.graph))
         # Else the noise that is learnt of them would fit their mistake.
         if not self.given.may_err_as_one(rows):
-            self.noise = self.noise.begun(
+            self.noise = self.noise.found(
                 self.noise.variance * noise_variance(self.innovations(rows)))
             self.solve()
 
