@@ -58,7 +58,7 @@ _CHANCE, _SHOWS = 1e-3, 0.1
 def repeated_factors(graph: FactorGraph) -> Indices:
     """Return the factors with the pair and the measurement of an earlier one, (k,)."""
     factors = graph.between
-    rows = np.flatnonzero(_has_parallel(graph))
+    rows = parallel_factors(graph)
     table = np.column_stack((factors.i[rows], factors.j[rows], factors.measurement[rows]))
     _, first = np.unique(table, axis=0, return_index=True)
     return np.delete(rows, first)
@@ -66,14 +66,10 @@ def repeated_factors(graph: FactorGraph) -> Indices:
 
 def parallel_factors(graph: FactorGraph) -> Indices:
     """Return the factors that share their pair of keyframes, either way round, (k,)."""
-    return np.flatnonzero(_has_parallel(graph))
-
-
-def _has_parallel(graph: FactorGraph) -> np.ndarray:
     factors = graph.between
     _, inverse, counts = np.unique(pair_key(factors.i, factors.j, graph.n_poses),
                                    return_inverse=True, return_counts=True)
-    return counts[inverse] > 1
+    return np.flatnonzero(counts[inverse] > 1)
 
 
 def connected_parts(graph: FactorGraph) -> list[Indices]:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from l1slam_ros.core import kernels
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.linear_system import with_world
@@ -201,7 +201,8 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     back = manifold.compose(known[second], manifold.inverse(said))
     error = manifold.residual(said[b], back[a], known[second][b])
     scatter = np.linalg.pinv(error.T @ error, hermitian=True)
-    near = _least((error @ scatter * error).sum(axis=1), _NEAREST * len(rows))
+    far = (error @ scatter * error).sum(axis=1)
+    near = np.argsort(far, kind='stable')[: _NEAREST * len(rows)]
     a = a[near]
     b = b[near]
     error = error[near]
@@ -219,15 +220,6 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     b = b[good]
     log_ratio = log_ratio[good]
     return np.concatenate((a, b)), np.concatenate((b, a)), np.tile(log_ratio, 2)
-
-
-def _least(values: Array, count: int) -> Indices:
-    """Return where the least of some values are, (count,), in ascending order."""
-    if count >= len(values):
-        return np.argsort(values, kind='stable')
-    some = np.sort(np.argpartition(values, count - 1)[:count])
-    least: Indices = some[np.argsort(values[some], kind='stable')]
-    return least
 
 
 def by_pair_of_parts(growth: Growth, rows: Indices) -> list[Indices]:
@@ -248,27 +240,21 @@ def _ends_by_part(growth: Growth, rows: Indices, high: Indices) -> Ends:
             np.where(turn[:, None], given.graph.manifold.inverse(Z), Z))
 
 
-def _follows(
-    manifold: Manifold, ends: Ends, poses: Array, a: Indices, b: Indices
-) -> tuple[Array, Array, Array]:
-    """Return F, Za S and S of pairs, (pairs, p): what follows from a for b is F Za S."""
-    low, high, Z = ends
-    poses = with_world(manifold, poses)
-    S = manifold.between(poses[high[a]], poses[high[b]])
-    return manifold.between(poses[low[b]], poses[low[a]]), manifold.compose(Z[a], S), S
-
-
 def _spread(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) -> Array:
     """
     Return what the map's uncertainty makes of the whitened difference of pairs, (pairs, k, k).
 
-    To first order Ad (Za S)^-1 and -Ad (F Za S)^-1 times the steps of the first ends of a and b,
-    -Ad S^-1 and the identity times those of the second ends.
+    From a follows F Za S for b, with F from the first end of b to that of a, and S from the second
+    end of a to that of b. To first order Ad (Za S)^-1 and -Ad (F Za S)^-1 times the steps of the
+    first ends of a and b, -Ad S^-1 and the identity times those of the second ends.
     """
     manifold = growth.given.graph.manifold
-    low, high, _ = ends
+    low, high, Z = ends
     samples, noise = growth.posterior.samples, growth.posterior.noise
-    F, onward, S = _follows(manifold, ends, growth.poses, a, b)
+    poses = with_world(manifold, growth.poses)
+    S = manifold.between(poses[high[a]], poses[high[b]])
+    onward = manifold.compose(Z[a], S)
+    F = manifold.between(poses[low[b]], poses[low[a]])
     J = [manifold.adjoint(manifold.inverse(T)) for T in (onward, manifold.compose(F, onward), S)]
     blocks = np.stack((roots @ J[0], -roots @ J[1], -roots @ J[2], roots), axis=1)
     keyframe = np.stack((low[a], low[b], high[a], high[b]), axis=1) - growth.posterior.fixed

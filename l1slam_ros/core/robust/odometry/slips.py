@@ -101,7 +101,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
 
     as_stated : the state where all may be as noisy as they say; what that explains needs no slip
     """
-    growth.slip_odds = growth.standing | {
+    growth.slip_odds = {
         step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
     if np.count_nonzero(~growth.given.is_loop & ~growth.cut) < _FEWEST_STEPS:
         return None
@@ -118,8 +118,6 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if state and evidence > most and (usual or (odds > 0 and len(steps) == 1)):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
-            if back:
-                state.put_back = dict.fromkeys(steps, (odds, state.accepted.copy()))
     found = found or with_runs(growth)
     if not found:
         growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion)
@@ -187,8 +185,7 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
         if len(common):
             suspects.append(int(common[np.argmax(odds[common])]))
         left_out = np.setdiff1d(left_out, group.rows)
-    standing = growth.standing
-    return [step for step in dict.fromkeys(suspects) if step not in standing]
+    return list(dict.fromkeys(suspects))
 
 
 def common_steps(growth: Growth, rows: Indices) -> Indices:

@@ -67,7 +67,6 @@ class Growth:
     nothing: the gaps, and where it slipped; part : (n,) number of the part of each keyframe;
     poses : (n, p) the L2 map of the accepted; posterior : of these; noise : as it was found;
     slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
-    put_back : of those that had been cut and fit, the same and what was accepted then, (m,) bool;
     ventured : (m,) bool, loops of runs that noisier odometry explained; drops : (m,) how often
     each was accepted and did not fit; fits_found : (m,) bool, not the loops that do not fit by the
     noise that was found; check : called before long steps, raises where the work shall stop.
@@ -84,7 +83,6 @@ class Growth:
         self.posterior: Posterior
         self._order: ChangingOrder | None = None
         self.slip_odds: dict[int, float] = {}
-        self.put_back: dict[int, tuple[float, Mask]] = {}
         none = np.zeros(len(given.factors), bool)
         self.ventured = none
         self.fits_found = ~none
@@ -100,7 +98,7 @@ class Growth:
                             repeated_factors(self.given.graph))
         # Else the noise that is learnt of them would fit their mistake.
         if not self.given.may_err_as_one(rows):
-            self.noise = self.noise.begun(
+            self.noise = self.noise.found(
                 self.noise.variance * noise_variance(self.innovations(rows)))
             self.solve()
 
@@ -214,16 +212,6 @@ class Growth:
         while len(news := self.news()):
             self.accepted[news] = True
             self.solve()
-
-    @property
-    def standing(self) -> dict[int, float]:
-        """
-        The odds to have slipped of steps that were put back, where nothing came in since.
-
-        To cut them again would lead to the same.
-        """
-        return {step: odds for step, (odds, accepted) in self.put_back.items()
-                if np.array_equal(accepted, self.accepted)}
 
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""

@@ -30,21 +30,20 @@ class Noise:
     """
     How noisy odometry and loops were found to be.
 
-    stated : (2,) the variance that they state; variance : (2,) theirs in units of that; first :
-    (2,) as it was found before any loop came in; learnt_of : (m,) bool, the factors of which it
-    was learnt last, (0,) of none; at_their_word : whether factors may be as noisy as they say.
+    stated : (2,) the variance that they state; variance : (2,) theirs in units of that;
+    learnt_of : (m,) bool, the factors of which it was learnt last, (0,) of none; at_their_word :
+    whether factors may be as noisy as they say.
     """
 
     stated: Array
     variance: Array
-    first: Array
     learnt_of: Mask
     at_their_word: bool = False
 
     @staticmethod
     def of(stated: Array) -> 'Noise':
         """Return the noise that is stated, of which nothing is learnt."""
-        return Noise(stated, within_ratio(np.ones(2), stated), np.ones(2), np.zeros(0, bool))
+        return Noise(stated, within_ratio(np.ones(2), stated), np.zeros(0, bool))
 
     @property
     def assumed(self) -> Array:
@@ -64,11 +63,6 @@ class Noise:
     def found(self, variance: Array) -> 'Noise':
         """Return the noise where its variance, (2,), was found anew."""
         return replace(self, variance=within_ratio(variance, self.stated))
-
-    def begun(self, variance: Array) -> 'Noise':
-        """Return the noise where its variance, (2,), was found before any loop came in."""
-        found = self.found(variance)
-        return replace(found, first=found.variance)
 
     def learnt(self, scale: Array, accepted: Mask) -> 'Noise':
         """Return the noise so many times as large, (2,), learnt of what is accepted, (m,)."""
