@@ -126,6 +126,7 @@ def robust_solve(
         for number, growth in enumerate(rounds(first, repair), 1):
             so_far = _so_far(growth, repair.drift)
             report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
+        growth.accept_tail()
         judgement = judgement_of(growth, doubts(growth, number < _MOST_ROUNDS, repair.rival))
         return replace(judgement, drift=repair.drift), growth.poses
     except _FAILURES as error:
@@ -350,6 +351,8 @@ def judge(
             if time.monotonic() > deadline and not growth.noise.at_their_word:
                 settled = False
                 break
+        if settled:
+            growth.accept_tail()
         reasons = doubts(growth) if settled else ()
         return replace(judgement_of(growth, reasons, settled), drift=known.drift), growth.poses
     except _FAILURES as error:
