@@ -17,7 +17,7 @@ Noise
     `gating.noise_variance` finds both from the loops themselves (expectation and maximisation),
     `rounds` measures them again as the map grows. In the last rounds factors may be as noisy as
     they say, so that no loop is refused for what it was predicted too well; but only loops that
-    fit by the noise that was found.
+    fit by the noise that was found, and last of all its tail (`Growth.accept_tail`).
 A true loop
     measures where its keyframes are, with normal noise. Predicted by the map without it, its
     innovation r has a covariance C from samples of the map (`innovation`), and r'C^-1 r stays
@@ -42,7 +42,7 @@ A slip
 A drift
     is an error of all steps, the same on each metre. Where loops are left out, or the odometry is
     far noisier than it says, it is a third explanation, asked before slips: odometry rid of it has
-    to win places or be less noisy (`drift`). Where all came in because the drift was learnt as
+    to win places, or be less noisy where it is noisier than stated (`drift`). Where all came in because the drift was learnt as
     noise, it is seen in what they leave of the odometry.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
