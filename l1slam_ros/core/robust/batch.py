@@ -17,7 +17,7 @@ Noise
     `gating.noise_variance` finds both from the loops themselves (expectation and maximisation),
     `rounds` measures them again as the map grows. In the last rounds factors may be as noisy as
     they say, so that no loop is refused for what it was predicted too well; but only loops that
-    fit by the noise that was found.
+    fit by the noise that was found, and last of all its tail (`Growth.accept_tail`).
 A true loop
     measures where its keyframes are, with normal noise. Predicted by the map without it, its
     innovation r has a covariance C from samples of the map (`innovation`), and r'C^-1 r stays
@@ -42,8 +42,8 @@ A slip
 A drift
     is an error of all steps, the same on each metre. Where loops are left out, or the odometry is
     far noisier than it says, it is a third explanation, asked before slips: odometry rid of it has
-    to win places or be less noisy (`drift`). Where all came in because the drift was learnt as
-    noise, it is seen in what they leave of the odometry.
+    to win places, or be less noisy where it was far noisier (`drift`). Where all came in because
+    the drift was learnt as noise, it is seen in what they leave of the odometry.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
@@ -126,6 +126,7 @@ def robust_solve(
         for number, growth in enumerate(rounds(first, repair), 1):
             so_far = _so_far(growth, repair.drift)
             report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
+        growth.accept_tail()
         judgement = judgement_of(growth, doubts(growth, number < _MOST_ROUNDS, repair.rival))
         return replace(judgement, drift=repair.drift), growth.poses
     except _FAILURES as error:
@@ -350,6 +351,8 @@ def judge(
             if time.monotonic() > deadline and not growth.noise.at_their_word:
                 settled = False
                 break
+        if settled:
+            growth.accept_tail()
         reasons = doubts(growth) if settled else ()
         return replace(judgement_of(growth, reasons, settled), drift=known.drift), growth.poses
     except _FAILURES as error:

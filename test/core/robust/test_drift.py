@@ -11,7 +11,7 @@
 import numpy as np
 import pytest
 from lies import careful_world, is_false, laps, position_error, spoilt
-from problems import chain_of, graph_of
+from problems import chain_of, graph_of, retold
 
 from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
 from l1slam_ros.core.robust import batch_map
@@ -69,6 +69,15 @@ def test_odometry_that_does_not_drift_is_left_as_it_is():
     assert not len(likely_drifts(WORLD.graph))
     bad = spoilt(WORLD, 'random', 400)
     assert batch_map.solve(bad.graph, None, batch_map.SolveOptions()).judgement.drift == 0
+
+
+@pytest.mark.parametrize('lies', [0, 100])
+def test_a_drift_within_what_the_odometry_states_is_left_with_lies_as_without(lies):
+    """Without lies nobody asks for it; by it no place is won."""
+    graph = straightened(spoilt(WORLD, 'random', lies).graph if lies else WORLD.graph, -0.004)
+    outcome = batch_map.solve(retold(graph, times=3.0), None, batch_map.SolveOptions(norm='l2'))
+    assert outcome.judgement.drift == 0
+    assert position_error(outcome.solution.poses, WORLD.truth) < 0.07
 
 
 def test_what_no_loop_can_tell_over_all_of_the_way_is_no_drift(rng):

@@ -121,17 +121,21 @@ def _explains(told: Growth, as_stated: Growth) -> bool:
     Return whether loops need the odometry to be rid of a drift.
 
     That is, hardly any fit without, or its odds are those of several places and the odometry is
-    no noisier, as it would be if lies came in by chance. And the loops are of several places: a
-    lap that closes at one place closes as well if it has a turn more.
+    no noisier, as it would be if lies came in by chance. A drift by which no place is won and
+    which is within what the odometry states is left, whether lies make it be asked for or not.
+    And the loops are of several places: a lap that closes at one place closes as well if it has a
+    turn more.
     """
     loops, before = (np.flatnonzero(state.accepted & state.given.is_loop)
                      for state in (told, as_stated))
     if told.given.may_err_as_one(loops, _DRIFT_PLACES):
         return False
-    calmer = told.noise.variance[0] <= as_stated.noise.variance[0]
+    noise = as_stated.noise.variance[0]
+    calmer = told.noise.variance[0] <= noise
+    needed = noise > NOISY or _places(told, told) > _places(told, as_stated)
     enough = _DRIFT_PLACES * told.given.log_odds_of_place
     return (len(before) <= _FEW * len(loops)
-            or bool(calmer and _log_odds(told, as_stated) >= enough))
+            or bool(needed and calmer and _log_odds(told, as_stated) >= enough))
 
 
 def _places(known: Growth, growth: Growth) -> int:

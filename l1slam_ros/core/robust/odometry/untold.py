@@ -28,6 +28,8 @@ from l1slam_ros.core.robust.rounds.growth import Growth
 
 # ln of odds from which on such a slip is a doubt: a map that is less likely right is doubted.
 LEAST = float(np.log(1 / CONFIDENT - 1))
+# Pairs of a loop and a step that are looked at together.
+_PAIRS = 20_000
 
 
 def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
@@ -57,11 +59,16 @@ def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
     odds = np.full(len(steps), -np.inf)
     root, spread = unwhitening(growth, rows), growth.innovations(rows).spread
     covariance = root @ (spread + np.eye(len(motion.mean))) @ root.transpose(0, 2, 1)
-    for row, known in zip(rows.tolist(), covariance, strict=True):
-        own = (given.low[row] <= given.low[steps]) & (given.high[row] >= given.high[steps])
-        if own.any():
-            more = _log_density(growth, motion, steps[own], row, known)
-            odds[own] = np.logaddexp(odds[own], more)
+    # So many at a time that what is worked out for each pair of them stays small.
+    size = max(1, _PAIRS // len(steps))
+    for some in (slice(first, first + size) for first in range(0, len(rows), size)):
+        own = (given.low[rows[some], None] <= given.low[steps]) & (
+            given.high[rows[some], None] >= given.high[steps])
+        row, step = np.nonzero(own)
+        more = np.full(own.shape, -np.inf)
+        more[row, step] = _log_density(growth, motion, steps[step], rows[some][row],
+                                       covariance[some][row])
+        odds = np.logaddexp(odds, np.logaddexp.reduce(more, axis=0))
     true, refused = len(np.unique(given.place[loops])) + 1, len(rows) + 1
     manifold = given.graph.manifold
     odds += np.log(true / refused / count) - motion.log_density(steps_of(growth, steps))
@@ -70,24 +77,22 @@ def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
     return {int(steps[np.argmax(odds)]): all_of_them} if np.isfinite(all_of_them) else {}
 
 
-def _log_density(growth: Growth, motion: Motion, steps: Indices, row: int,
+def _log_density(growth: Growth, motion: Motion, steps: Indices, rows: Indices,
                  known: Array) -> Array:
     """
-    Return ln p(y as motion) p_slip(z | y) of steps z that a loop spans, (k,).
+    Return ln p(y as motion) p_slip(z | y) of steps z, each of a loop that spans it, (k,).
 
-    known : (d, d) the covariance of the loop, predicted without it
+    rows : (k,) the loops; known : (k, d, d) the covariance of each, predicted without it
     """
     given = growth.given
     manifold, poses = given.graph.manifold, growth.poses
-    count = len(steps)
-    first, last = (np.tile(poses[end], (count, 1)) for end in (given.low[row], given.high[row]))
-    after = manifold.between(poses[given.high[steps]], last)
-    Z = np.tile(given.factors.measurement[row], (count, 1))
-    y = manifold.compose(manifold.between(poses[given.low[steps]], first),
-                         manifold.compose(Z, manifold.inverse(after)))
+    after = manifold.between(poses[given.high[steps]], poses[given.high[rows]])
+    before = manifold.between(poses[given.low[steps]], poses[given.low[rows]])
+    y = manifold.compose(before, manifold.compose(given.factors.measurement[rows],
+                                                  manifold.inverse(after)))
     carried = manifold.adjoint(after)
     spread = carried @ known @ carried.transpose(0, 2, 1)
-    start = manifold.identity(count)
+    start = manifold.identity(len(rows))
     J = manifold.local_jacobian(start, y)
     moved = motion.log_density(manifold.local(start, y), J @ spread @ J.transpose(0, 2, 1))
     slip = manifold.local(y, given.factors.measurement[steps])

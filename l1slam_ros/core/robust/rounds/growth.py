@@ -45,6 +45,9 @@ from l1slam_ros.core.solvers.gauss_newton import ChangingOrder, l2_optimum
 _DROPPED = 2e-5
 # A loop that was dropped that often is not tried again; half and double make none of 89 worse.
 _CHANCES = 2
+# The tail of the noise ends no further off than so many times what nearly all stay below, in
+# squares.
+_TAIL = 2.0
 # What is measured of the noise counts against as many factors on which it was measured before.
 _KNOWN = 20
 # Noise that is so many times the variance that was found is measured anew before any loop is
@@ -212,6 +215,30 @@ class Growth:
         while len(news := self.news()):
             self.accepted[news] = True
             self.solve()
+
+    def accept_tail(self) -> None:
+        """
+        Accept loops that fit as they say, though not by the noise found, where they stand apart.
+
+        They are the tail of the noise, or lies that are not far off. Lies of a corridor are off by
+        anything along it: that the n nearest ones, those beside others not counted, are within
+        the part c of how far the next one is off, has the probability c^n.
+        """
+        given = self.given
+        rows = np.flatnonzero(~self.fits_found & ~self.accepted)
+        found = self.innovations(rows)
+        off = found.square / given.gate(found.freedom)
+        order = np.argsort(off, kind='stable')
+        rank = np.full(len(given.factors), len(rows))
+        rank[rows[order]] = np.arange(len(rows))
+        one, other = given.mates
+        count = np.cumsum(~np.isin(rows[order], one[rank[other] < rank[one]]))
+        apart = np.diff(np.log(off[order]), append=np.inf) / 2 * count > np.log(1 / DOUBT)
+        end = np.flatnonzero(apart & (off[order] < _TAIL)).max(initial=-1)
+        tail = rows[order[:end + 1]]
+        if len(tail):
+            self.fits_found[tail] = True
+            self.accept_more()
 
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
