@@ -54,20 +54,29 @@ def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
     steps = steps[across[given.low[steps]] == 0]
     if not len(rows) or not len(steps):
         return {}
-    odds = np.full(len(steps), -np.inf)
-    root, spread = unwhitening(growth, rows), growth.innovations(rows).spread
-    covariance = root @ (spread + np.eye(len(motion.mean))) @ root.transpose(0, 2, 1)
-    for row, known in zip(rows.tolist(), covariance, strict=True):
-        own = (given.low[row] <= given.low[steps]) & (given.high[row] >= given.high[steps])
-        if own.any():
-            more = _log_density(growth, motion, steps[own], row, known)
-            odds[own] = np.logaddexp(odds[own], more)
+    odds = np.logaddexp.reduce(slips_told(growth, motion, steps, rows), axis=0)
     true, refused = len(np.unique(given.place[loops])) + 1, len(rows) + 1
-    manifold = given.graph.manifold
     odds += np.log(true / refused / count) - motion.log_density(steps_of(growth, steps))
-    odds += claimed_volume(manifold, growth.poses)[manifold.TRANSLATION].sum()
     all_of_them = float(np.logaddexp.reduce(odds))
     return {int(steps[np.argmax(odds)]): all_of_them} if np.isfinite(all_of_them) else {}
+
+
+def slips_told(growth: Growth, motion: Motion, steps: Indices, rows: Indices) -> Array:
+    """
+    Return ln p(y as motion) p_slip(z | y) V of steps z by refused loops, (loops, steps).
+
+    -inf where a loop does not span a step.
+    """
+    given = growth.given
+    told = np.full((len(rows), len(steps)), -np.inf)
+    root, spread = unwhitening(growth, rows), growth.innovations(rows).spread
+    covariance = root @ (spread + np.eye(len(motion.mean))) @ root.transpose(0, 2, 1)
+    for number, (row, known) in enumerate(zip(rows.tolist(), covariance, strict=True)):
+        own = (given.low[row] <= given.low[steps]) & (given.high[row] >= given.high[steps])
+        if own.any():
+            told[number, own] = _log_density(growth, motion, steps[own], row, known)
+    manifold = given.graph.manifold
+    return told + claimed_volume(manifold, growth.poses)[manifold.TRANSLATION].sum()
 
 
 def _log_density(growth: Growth, motion: Motion, steps: Indices, row: int,
