@@ -161,10 +161,12 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, least: float | Non
         usual = False
         if state:
             state, step, usual = _cut_rather(state, step, motion)
-        own = float(odds[step]) - costs
-        yield [step], own, state, usual
-        if state and least is None and (
-                not usual or own + gain_of_places(growth, as_stated, state) <= 0):
+        gain = gain_of_places(growth, as_stated, state) if state else 0.0
+        if costs and least is None and gain <= costs:  # as if it had fallen apart
+            yield [step], float(odds[step]), None, False
+        else:
+            yield [step], float(odds[step]) - costs, state, usual
+        if state and least is None and (not usual or odds[step] + gain <= costs):
             for second, other, both, moves in _tried(
                     state, state, motion, SURE if usual else np.inf):
                 one = step
@@ -215,8 +217,7 @@ def _without(growth: Growth, step: int, motion: Motion) -> tuple[Growth | None, 
     Return the state after the rounds that follow if a step is cut, and what it costs, ln of odds.
 
     None: it falls apart. Where loops of two places or a long run do not join its sides, those do
-    that came in before, else the one by which the robot moved there most as elsewhere. That one
-    was chosen, so its place says nothing.
+    that came in before, else the one that shows a slip best: chosen, its place says nothing.
     """
     state, span = growth.copy(), growth.given.spanning(step)
     state.cut[step] = True
