@@ -40,6 +40,7 @@ from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
 from l1slam_ros.core.robust.pairwise_consistency import (
     agree_at_a_place,
     longest_run,
+    runs,
     spanned,
     strongest_group,
 )
@@ -98,7 +99,8 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     """
     Yield the loops of one place, accepted or not, that alone say how two parts lie to each other.
 
-    Parts are what is between two gaps, or slips that were cut.
+    Parts are what is between two gaps, or slips that were cut. Of a slip, a run says enough: a lie
+    of many loops hardly has the robot move there as elsewhere.
     """
     given = growth.given
     sure = ~given.is_loop | given.trusted | given.factors.is_absolute
@@ -117,7 +119,8 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
         if joined < without:
             # Rivals that say it otherwise are of the same doubt.
             joins |= own
-            yield rows[own]
+            if given.gap.any() or not runs(growth, rows[own]):
+                yield rows[own]
 
 
 def _joining_otherwise(growth: Growth) -> Iterator[Indices]:

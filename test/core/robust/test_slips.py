@@ -10,7 +10,7 @@
 
 import numpy as np
 import pytest
-from lies import careful_world, position_error, slipped, spoilt
+from lies import CAREFUL, careful_world, laps, position_error, slipped, spoilt
 from problems import chain_of, graph_of, measure, retold, straight
 from test_pairwise_consistency import STEP, TURN, grown
 
@@ -84,6 +84,18 @@ def test_a_slip_of_odometry_that_drifts_within_its_noise():
     assert graph.between.i[judgement.slips].tolist() == [STEP] and not judgement.doubts
 
 
+@pytest.mark.parametrize('n, rounds, loops, steps, metres', [
+    (300, 2, 120, [100], 5.0), (300, 2, 120, [100, 180], 3.0), (240, 3, 100, [100, 110], 2.0)])
+def test_where_all_loops_along_a_lap_are_of_one_place_they_still_tell_of_slips(
+        n, rounds, loops, steps, metres):
+    """A run of them joins what a cut left in two; of the last two each was unlikely by itself."""
+    rng = np.random.default_rng(1)
+    world = spoilt(laps(n, rounds, loops, CAREFUL, rng), 'random', loops // 3)
+    judgement, poses = robust_solve(graph := slipped(world.graph, steps, [0.0, metres, 0.0]))
+    assert graph.between.i[judgement.slips].tolist() == steps and not judgement.doubts
+    assert position_error(poses, world.truth) < 0.4
+
+
 @pytest.mark.parametrize('stated, turn, named', [(1.0, 0.14, [STEP]), (10.0, 0.14, []),
                                                  (10.0, 0.2, [STEP])])
 def test_what_is_within_the_noise_as_stated_is_no_slip(bad, stated, turn, named):
@@ -129,7 +141,7 @@ def test_where_no_loops_across_agree_a_step_is_not_cut_for_an_unusual_motion(bad
     monkeypatch.setattr(Growth, 'solve', lambda growth: pytest.fail('solved'))
     growth.given.factors.measurement[left_out] += np.random.default_rng(0).normal(
         0.0, 50.0, (np.count_nonzero(left_out), 3))
-    assert slips._without(growth, STEP) is None
+    assert slips._without(growth, STEP, usual_motion(growth))[0] is None
 
 
 @pytest.mark.parametrize('seed, turn', [(0, 0.01), (1, 0.02)])

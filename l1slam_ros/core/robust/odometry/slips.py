@@ -34,9 +34,10 @@ from l1slam_ros.core.robust.odometry.motion import (
     usual_motion,
 )
 from l1slam_ros.core.robust.odometry.noisier import with_runs
-from l1slam_ros.core.robust.odometry.untold import LEAST, untold_slip
+from l1slam_ros.core.robust.odometry.untold import LEAST, slips_told, untold_slip
 from l1slam_ros.core.robust.pairwise_consistency import (
     Group,
+    asked,
     by_pair_of_parts,
     longest_run,
     spanned,
@@ -111,6 +112,9 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         back = _put_back(state, steps, motion) if state else None
         state, odds = back or (state, odds)
         gain = gain_of_places(growth, as_stated, state) if state and usual else 0.0
+        if state and usual and not back and not (state.accepted & ~growth.accepted).any():
+            # The noise was learnt of the slip, too, and explains it better than it is.
+            odds = max(odds, float(log_odds_of_slips(state, motion)[steps].min()))
         # No slip has to be believed where only a lie had bent the map.
         evidence = gain if back else odds + gain
         if len(steps) == 1:
@@ -134,32 +138,40 @@ def _odds_in_the_end(growth: Growth, as_stated: Growth, motion: Motion) -> dict[
     return {step: max(odds, growth.slip_odds.get(step, odds)) for step, odds in last.items()}
 
 
-def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
+def _tried(growth: Growth, as_stated: Growth, motion: Motion, least: float | None = None
            ) -> Iterator[tuple[list[int], float, Growth | None, bool]]:
     """
     Yield steps, their log odds to have slipped, the state without them, and whether that is usual.
 
     None: it falls apart. It is usual if the robot, repaired, moves as elsewhere at each of them.
     Where it is not, a second step bends what the loops across the first one say: the likeliest
-    are tried, too, however unlikely each is by itself.
+    are tried, however unlikely each is by itself. Where it is, and the loops say too little, only
+    one that would be suspected now.
 
-    first : whether nothing else is cut for it
+    least : how large the odds against a second step are at most; None: nothing else is cut
     """
     odds, left_out = log_odds_of_slips(growth, motion), as_stated.undecided()
     # Where loops are left out, one more place may be won.
-    least = max(SURE, growth.given.log_odds_of_place) if len(left_out) else SURE
-    for step in _suspected(growth, odds, left_out, least if first else np.inf):
-        state, usual = _without(growth, step), False
+    most = max(SURE, growth.given.log_odds_of_place) if len(left_out) else SURE
+    groups = left_out[:0] if least == SURE else left_out
+    for step in _suspected(growth, odds, groups, most if least is None else least):
+        state, costs = _without(growth, step, motion)
+        usual = False
         if state:
             state, step, usual = _cut_rather(state, step, motion)
-        yield [step], float(odds[step]), state, usual
-        if first and state and not usual:
-            for second, other, both, usual in _tried(state, state, motion, False):
+        gain = gain_of_places(growth, as_stated, state) if state else 0.0
+        if costs and least is None and gain <= costs:  # as if it had fallen apart
+            yield [step], float(odds[step]), None, False
+        else:
+            yield [step], float(odds[step]) - costs, state, usual
+        if state and least is None and (not usual or odds[step] + gain <= costs):
+            for second, other, both, moves in _tried(
+                    state, state, motion, SURE if usual else np.inf):
                 one = step
                 if both:
-                    both, one, moves = _cut_rather(both, step, motion)
-                    usual = usual and moves
-                yield [one, *second], float(odds[one]) + other, both, usual
+                    both, one, as_ever = _cut_rather(both, step, motion)
+                    moves = moves and as_ever
+                yield [one, *second], float(odds[one]) - costs + other, both, moves
 
 
 def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> list[int]:
@@ -197,21 +209,49 @@ def common_steps(growth: Growth, rows: Indices) -> Indices:
     return steps
 
 
-def _without(growth: Growth, step: int) -> Growth | None:
-    """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
+def _without(growth: Growth, step: int, motion: Motion) -> tuple[Growth | None, float]:
+    """
+    Return the state after the rounds that follow if a step is cut, and what it costs, ln of odds.
+
+    None: it falls apart. Where loops of two places or a long run do not join its sides, those do
+    that came in before, else the one that shows a slip best: chosen, its place says nothing.
+    """
     state, span = growth.copy(), growth.given.spanning(step)
     state.cut[step] = True
     state.drops[:] = 0
-    if not (state.accepted & span).any():  # each side stays as it is
+    kept, costs = state.copy(), 0.0
+    told = (state.accepted & span).any()
+    if told:
+        state.accepted[span] = state.given.trusted[span]
+        state.solve()
+    else:  # each side stays as it is
         state.label_parts()
-        if len(strongest_across(state).places) < TWO_PLACES:
-            return None
-    state.accepted[span] = state.given.trusted[span]
-    state.solve()
-    if not join(state) or state.across()[step]:
-        return None
+    if not join(state, by_runs=True) or state.across()[step]:
+        if told:
+            kept.solve()
+        if told and not kept.across()[step]:
+            state = kept
+        elif _join_as_usual(state, step, motion):
+            costs = state.given.log_odds_of_place
+        else:
+            return None, 0.0
     state.accept_more()
-    return state
+    return state, costs
+
+
+def _join_as_usual(state: Growth, step: int, motion: Motion) -> bool:
+    """Join the sides of a step by the loop that shows a slip there rather than lies, or none."""
+    given, part = state.given, state.part
+    rows, cut = state.joining(), np.array([step])
+    rows = asked(state, rows[(part[given.low[rows]] == part[given.low[step]])
+                             & (part[given.high[rows]] == part[given.high[step]])
+                             & (given.factors.freedom[rows] == len(motion.mean))])
+    told = slips_told(state, motion, cut, rows)[:, 0]
+    if told.max(initial=-np.inf) < motion.log_density(steps_of(state, cut))[0]:
+        return False
+    best = rows[[np.argmax(told)]]
+    _join_by(state, Group(best, given.place[best]))
+    return not state.across()[step]
 
 
 def _likeliest(state: Growth, cut: int, motion: Motion) -> int:

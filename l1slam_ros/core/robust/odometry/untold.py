@@ -56,25 +56,33 @@ def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
     steps = steps[across[given.low[steps]] == 0]
     if not len(rows) or not len(steps):
         return {}
-    odds = np.full(len(steps), -np.inf)
+    odds = np.logaddexp.reduce(slips_told(growth, motion, steps, rows), axis=0)
+    true, refused = len(np.unique(given.place[loops])) + 1, len(rows) + 1
+    odds += np.log(true / refused / count) - motion.log_density(steps_of(growth, steps))
+    all_of_them = float(np.logaddexp.reduce(odds))
+    return {int(steps[np.argmax(odds)]): all_of_them} if np.isfinite(all_of_them) else {}
+
+
+def slips_told(growth: Growth, motion: Motion, steps: Indices, rows: Indices) -> Array:
+    """
+    Return ln p(y as motion) p_slip(z | y) V of steps z by refused loops, (loops, steps).
+
+    -inf where a loop does not span a step.
+    """
+    given = growth.given
+    told = np.full((len(rows), len(steps)), -np.inf)
     root, spread = unwhitening(growth, rows), growth.innovations(rows).spread
     covariance = root @ (spread + np.eye(len(motion.mean))) @ root.transpose(0, 2, 1)
     # So many at a time that what is worked out for each pair of them stays small.
-    size = max(1, _PAIRS // len(steps))
-    for some in (slice(first, first + size) for first in range(0, len(rows), size)):
-        own = (given.low[rows[some], None] <= given.low[steps]) & (
-            given.high[rows[some], None] >= given.high[steps])
-        row, step = np.nonzero(own)
-        more = np.full(own.shape, -np.inf)
-        more[row, step] = _log_density(growth, motion, steps[step], rows[some][row],
-                                       covariance[some][row])
-        odds = np.logaddexp(odds, np.logaddexp.reduce(more, axis=0))
-    true, refused = len(np.unique(given.place[loops])) + 1, len(rows) + 1
+    size = max(1, _PAIRS // max(len(steps), 1))
+    for first in range(0, len(rows), size):
+        some = rows[first:first + size]
+        row, step = np.nonzero((given.low[some, None] <= given.low[steps])
+                               & (given.high[some, None] >= given.high[steps]))
+        told[first + row, step] = _log_density(
+            growth, motion, steps[step], some[row], covariance[first + row])
     manifold = given.graph.manifold
-    odds += np.log(true / refused / count) - motion.log_density(steps_of(growth, steps))
-    odds += claimed_volume(manifold, growth.poses)[manifold.TRANSLATION].sum()
-    all_of_them = float(np.logaddexp.reduce(odds))
-    return {int(steps[np.argmax(odds)]): all_of_them} if np.isfinite(all_of_them) else {}
+    return told + claimed_volume(manifold, growth.poses)[manifold.TRANSLATION].sum()
 
 
 def _log_density(growth: Growth, motion: Motion, steps: Indices, rows: Indices,
