@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What an update that does not wait leaves to others, and what a worker leaves to an update."""
 
+import threading
 import time
 from types import SimpleNamespace
 
@@ -16,7 +17,7 @@ import pytest
 from problems import EVERY, drive_on, straight
 
 from l1slam_ros.core.running.backend import Backend
-from l1slam_ros.core.running.keeper import updates, work
+from l1slam_ros.core.running.keeper import updates, work, workers
 from l1slam_ros.core.running.keeper.keeper import Keeper
 
 
@@ -67,3 +68,23 @@ def test_a_front_that_is_full_catches_up_no_more():
     graph = Growing(60)
     graph.closed = True
     assert work._caught_up(graph, graph, np.ones(0, bool), False, lambda: None) == []
+
+
+def test_the_interpreter_lock_is_given_away_only_for_a_thread_that_waits(monkeypatch):
+    given = []
+    monkeypatch.setattr(workers.time, 'sleep', lambda seconds: given.append(seconds))
+    lock = workers.PoliteLock()
+    with lock:
+        pass
+    lock.let_others()
+    assert not given
+    with lock:
+        waiting = threading.Thread(target=lock.__enter__)
+        waiting.start()
+        while not lock._waiting:
+            pass
+        lock.let_others()
+    assert given == [0]
+    waiting.join()
+    lock.let_others()
+    assert given == [0]

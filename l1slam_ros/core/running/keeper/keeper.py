@@ -38,6 +38,7 @@ from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.core.running.keeper.schedule import Size
+from l1slam_ros.core.running.keeper.workers import PoliteLock
 from l1slam_ros.core.running.map_state import Carried, MapState
 from l1slam_ros.core.running.map_to_odom import MapToOdom, Newest, move_all
 from l1slam_ros.core.running.optimised import Optimised
@@ -82,7 +83,7 @@ class Keeper:
     """
 
     def __init__(self, builder: GraphBuilder, solver: OptimiserOptions, robust: bool):
-        self._front_lock, self._graph_lock = threading.Lock(), threading.Lock()
+        self._front_lock, self._graph_lock = PoliteLock(), threading.Lock()
         self._builder, self._solver, self._robust = builder, solver, robust
         self._front: Front | None = None
         nothing = Optimised.nothing(builder.graph.manifold.identity(0))
@@ -261,7 +262,7 @@ class Keeper:
                 if not self._take_some():
                     break
             taken = True
-            time.sleep(0)  # else a thread that waits for the lock would wait for the deadline
+            self._front_lock.let_others()  # else they would wait for the deadline
         if taken:
             with self._front_lock:
                 with self._graph_lock:
