@@ -95,9 +95,10 @@ def measure(drive: Drive, keyframes: int, rate: float) -> Taken:
     with Backend(_EVERY, drive.dimension, background=True) as backend:
         due = time.perf_counter()
         for _, (sample, loops) in zip(range(keyframes), drive.messages, strict=False):
-            calls = [partial(backend.add_odometry, sample),
-                     *(partial(backend.add_loop, loop) for loop in loops),
-                     partial(backend.update, _BUDGET)]
+            calls: list[Callable[[], object]] = [
+                partial(backend.add_odometry, sample),
+                *(partial(backend.add_loop, loop) for loop in loops),
+                partial(backend.update, _BUDGET)]
             seconds = np.array([_seconds(call) for call in calls])
             taken.append(Taken(*seconds.sum(axis=0), *seconds.max(axis=0)))
             now = time.perf_counter()
