@@ -17,7 +17,7 @@ import pytest
 from problems import EVERY, drive_on, straight
 
 from l1slam_ros.core.running.backend import Backend
-from l1slam_ros.core.running.keeper import updates, work, workers
+from l1slam_ros.core.running.keeper import keeper, updates, work, workers
 from l1slam_ros.core.running.keeper.keeper import Keeper
 
 
@@ -34,6 +34,22 @@ def test_an_update_that_does_not_wait_takes_factors_for_a_moment(
         drive_on(backend, straight(3))
         backend.update(5.0)
     assert longest / 2 < max(given) <= longest
+
+
+@pytest.mark.parametrize('each, taken', [(0.001, 7), (0.003, 2), (0.004, 1), (0.02, 1)])
+def test_an_update_begins_with_no_more_factors_than_it_has_time_for(monkeypatch, each, taken):
+    now = []
+    monkeypatch.setattr(keeper.time, 'monotonic', lambda: each * len(now))
+
+    def take(_):
+        now.append(each)
+        return True
+
+    with Backend(EVERY) as backend:
+        monkeypatch.setattr(Keeper, '_take_some', take)
+        backend._keeper.take_what_has_come(0.0071)
+        assert len(now) == taken
+        monkeypatch.undo()
 
 
 class Growing:
