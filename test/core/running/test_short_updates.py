@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What an update that does not wait leaves to others, and what a worker leaves to an update."""
 
+import threading
 import time
 from types import SimpleNamespace
 
@@ -16,7 +17,7 @@ import pytest
 from problems import EVERY, drive_on, straight
 
 from l1slam_ros.core.running.backend import Backend
-from l1slam_ros.core.running.keeper import updates, work
+from l1slam_ros.core.running.keeper import keeper, updates, work, workers
 from l1slam_ros.core.running.keeper.keeper import Keeper
 
 
@@ -33,6 +34,22 @@ def test_an_update_that_does_not_wait_takes_factors_for_a_moment(
         drive_on(backend, straight(3))
         backend.update(5.0)
     assert longest / 2 < max(given) <= longest
+
+
+@pytest.mark.parametrize('each, taken', [(0.001, 7), (0.003, 2), (0.004, 1), (0.02, 1)])
+def test_an_update_begins_with_no_more_factors_than_it_has_time_for(monkeypatch, each, taken):
+    now = []
+    monkeypatch.setattr(keeper.time, 'monotonic', lambda: each * len(now))
+
+    def take(_):
+        now.append(each)
+        return True
+
+    with Backend(EVERY) as backend:
+        monkeypatch.setattr(Keeper, '_take_some', take)
+        backend._keeper.take_what_has_come(0.0071)
+        assert len(now) == taken
+        monkeypatch.undo()
 
 
 class Growing:
@@ -67,3 +84,23 @@ def test_a_front_that_is_full_catches_up_no_more():
     graph = Growing(60)
     graph.closed = True
     assert work._caught_up(graph, graph, np.ones(0, bool), False, lambda: None) == []
+
+
+def test_the_interpreter_lock_is_given_away_only_for_a_thread_that_waits(monkeypatch):
+    given = []
+    monkeypatch.setattr(workers.time, 'sleep', lambda seconds: given.append(seconds))
+    lock = workers.PoliteLock()
+    with lock:
+        pass
+    lock.let_others()
+    assert not given
+    with lock:
+        waiting = threading.Thread(target=lock.__enter__)
+        waiting.start()
+        while not lock._waiting:
+            pass
+        lock.let_others()
+    assert given == [0]
+    waiting.join()
+    lock.let_others()
+    assert given == [0]

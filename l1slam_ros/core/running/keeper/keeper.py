@@ -17,9 +17,8 @@ counts all changes and tells whether a stored result is still up to date.
                     never wait
 
 A thread that needs both takes them in this order; neither is held while solving, or while a file
-is read or written. The state changes under both locks. A map that begins anew is the exception: it
-needs the graph lock alone, and a result that was computed for the map before is refused
-(`Interrupted`) when it is handed in.
+is read or written. The state changes under both locks, or under the graph lock alone where a map
+begins anew: a result that was computed for the map before is refused then (`Interrupted`).
 """
 
 import threading
@@ -38,6 +37,7 @@ from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.core.running.keeper.schedule import Size
+from l1slam_ros.core.running.keeper.workers import PoliteLock
 from l1slam_ros.core.running.map_state import Carried, MapState
 from l1slam_ros.core.running.map_to_odom import MapToOdom, Newest, move_all
 from l1slam_ros.core.running.optimised import Optimised
@@ -82,7 +82,7 @@ class Keeper:
     """
 
     def __init__(self, builder: GraphBuilder, solver: OptimiserOptions, robust: bool):
-        self._front_lock, self._graph_lock = threading.Lock(), threading.Lock()
+        self._front_lock, self._graph_lock = PoliteLock(), threading.Lock()
         self._builder, self._solver, self._robust = builder, solver, robust
         self._front: Front | None = None
         nothing = Optimised.nothing(builder.graph.manifold.identity(0))
@@ -255,14 +255,14 @@ class Keeper:
         """
         with self._front_lock, self._graph_lock:
             self._add_due_loops()
-        taken = False
-        while time.monotonic() < deadline and not in_vain():
+        took = 0.0  # [s] by the factors before, if any
+        while (now := time.monotonic()) + took < deadline and not in_vain():
             with self._front_lock:
                 if not self._take_some():
                     break
-            taken = True
-            time.sleep(0)  # else a thread that waits for the lock would wait for the deadline
-        if taken:
+            self._front_lock.let_others()  # else they would wait for the deadline
+            took = time.monotonic() - now
+        if took:
             with self._front_lock:
                 with self._graph_lock:
                     front, state, seen = self._front, self._state, Seen.of(self._builder)

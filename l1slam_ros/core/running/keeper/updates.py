@@ -39,8 +39,8 @@ from l1slam_ros.core.running.keeper.workers import (
 )
 from l1slam_ros.core.running.problem import as_numbered, as_one, by_robot
 
-# [s] The time for which an update puts factors into the front, unless it waits longer anyway. A
-# few factors take up to 6 ms, so an update that does not wait takes some 14 ms at the most.
+# [s] The time for which an update puts factors into the front, unless it waits longer anyway. It
+# begins with no more where the last few took longer than what is left.
 _LEAST_TIME = 0.007
 
 

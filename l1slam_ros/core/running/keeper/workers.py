@@ -15,6 +15,7 @@ In: pieces of work, as functions. Out: that they have ended, or the error that t
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -114,6 +115,32 @@ class Requests:
         """Wait until nobody asks."""
         with self._none:
             self._none.wait_for(lambda: not self._count)
+
+
+class PoliteLock:
+    """A lock for `with` whose holder can let a thread that waits for it go first."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting = Requests()
+
+    def __enter__(self) -> None:
+        if not self._lock.acquire(blocking=False):
+            with self._waiting.one():
+                self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def let_others(self) -> None:
+        """
+        Give a thread that waits for it the time to take it; the caller has released it.
+
+        If none waits this does nothing: who gives the interpreter's lock away without need may
+        wait for a switch interval, 5 ms, until it is given back.
+        """
+        if self._waiting:
+            time.sleep(0)
 
 
 class Worker:
