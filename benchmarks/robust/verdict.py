@@ -133,14 +133,14 @@ MADE: dict[str, Callable[[int], Place]] = {
 
 
 # Kinds of drawn worlds. The first number of a seed is that of its set: weights are fitted on the
-# first, the others are fresh. Rules were made with a look at the second to the eighth.
+# first, the others are fresh. Rules were made with a look at the second to the ninth.
 _DRAWN: dict[str, Callable[[np.random.Generator], Place]] = {
     'streets': drawn.streets, 'laps': drawn.laps, 'spokes': drawn.spokes, 'lawn': drawn.lawn,
     'rings': lambda rng: _ring(int(rng.integers(10**6)), rng.random() < 0.3),
     'corridors': lambda rng: _corridor(int(rng.integers(10**6)), rng.random() < 0.3)}
 FITTED = 1
-_LOOKED_AT = 2, 3, 4, 5, 6, 7, 8
-_NEVER_SEEN = 9
+_LOOKED_AT = 2, 3, 4, 5, 6, 7, 8, 9
+_NEVER_SEEN = 10
 
 
 def runs_drawn(base: int, count: int) -> Iterator[Row]:
