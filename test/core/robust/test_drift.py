@@ -71,10 +71,16 @@ def test_odometry_that_does_not_drift_is_left_as_it_is():
     assert batch_map.solve(bad.graph, None, batch_map.SolveOptions()).judgement.drift == 0
 
 
+def test_a_drift_beyond_what_the_odometry_states_is_taken_though_no_place_is_won():
+    graph = straightened(spoilt(WORLD, 'random', 100).graph, -0.004)
+    outcome = batch_map.solve(retold(graph, times=3.0), None, batch_map.SolveOptions(norm='l2'))
+    assert outcome.judgement.drift == pytest.approx(0.004, abs=1e-3)
+
+
 @pytest.mark.parametrize('lies', [0, 100])
 def test_a_drift_within_what_the_odometry_states_is_left_with_lies_as_without(lies):
     """Without lies nobody asks for it; by it no place is won."""
-    graph = straightened(spoilt(WORLD, 'random', lies).graph if lies else WORLD.graph, -0.004)
+    graph = straightened(spoilt(WORLD, 'random', lies).graph if lies else WORLD.graph, -0.002)
     outcome = batch_map.solve(retold(graph, times=3.0), None, batch_map.SolveOptions(norm='l2'))
     assert outcome.judgement.drift == 0
     assert position_error(outcome.solution.poses, WORLD.truth) < 0.07

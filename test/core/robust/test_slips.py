@@ -132,6 +132,23 @@ def test_what_fits_the_loops_that_come_in_without_it_did_not_slip(bad):
     assert max(found.slip_odds.values()) < -SURE
 
 
+def test_a_loop_that_was_chosen_shows_a_slip_or_nothing(bad, monkeypatch):
+    """A step is cut and put back, and loops come in; but the first was the best of many."""
+    growth = grown(bad.graph)
+    (step,) = np.flatnonzero(~growth.given.is_loop & (growth.given.low == STEP))
+    growth.accepted[growth.accepted & growth.given.spanning(step)] = False
+    growth.solve()
+    tried = slips._tried
+    monkeypatch.setattr(slips, '_tried', lambda *given: (
+        (steps, odds, costs or chosen, state, usual)
+        for steps, odds, costs, state, usual in tried(*given)))
+    monkeypatch.setattr(slips, 'with_runs', lambda growth: None)
+    chosen = 0.0
+    assert without_slip(growth, growth)
+    chosen = growth.given.log_odds_of_place
+    assert without_slip(growth, growth) is None
+
+
 def test_where_no_loops_across_agree_a_step_is_not_cut_for_an_unusual_motion(bad, monkeypatch):
     """Nothing accepted spans it, so each side stays as it is: no map is made to find that out."""
     growth = grown(bad.graph.subset(np.arange(len(bad.graph.between))))

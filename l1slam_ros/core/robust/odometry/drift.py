@@ -26,7 +26,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL, log_prior
-from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
+from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES, Evidence
 from l1slam_ros.core.robust.rounds.growth import Growth
 
 # A drift is believed of loops of so many places at least, if it is likelier by what these are
@@ -93,7 +93,7 @@ def likeliest(some: list[Straight], as_stated: Growth) -> tuple[Straight | None,
     for straight in some:
         if not best or straight.log_odds(best) > 0:
             best = straight
-    if not best or not _explains(best.told, as_stated):
+    if not best or not _explains(best, as_stated):
         return None, 0.0
     odds, more = min(((best.log_odds(other), other.drift - best.drift)
                       for other in some if other is not best), default=(np.inf, 0.0))
@@ -116,7 +116,7 @@ def _log_odds(one: Growth, other: Growth) -> float:
     return float(freedom @ calmer / 2 + more * one.given.log_odds_of_place)
 
 
-def _explains(told: Growth, as_stated: Growth) -> bool:
+def _explains(straight: Straight, as_stated: Growth) -> bool:
     """
     Return whether loops need the odometry to be rid of a drift.
 
@@ -126,16 +126,27 @@ def _explains(told: Growth, as_stated: Growth) -> bool:
     And the loops are of several places: a lap that closes at one place closes as well if it has a
     turn more.
     """
+    told = straight.told
     loops, before = (np.flatnonzero(state.accepted & state.given.is_loop)
                      for state in (told, as_stated))
     if told.given.may_err_as_one(loops, _DRIFT_PLACES):
         return False
     noise = as_stated.noise.variance[0]
     calmer = told.noise.variance[0] <= noise
-    needed = noise > NOISY or _places(told, told) > _places(told, as_stated)
+    needed = (noise > NOISY or _places(told, told) > _places(told, as_stated)
+              or not _is_stated(straight.drift, as_stated.given))
     enough = _DRIFT_PLACES * told.given.log_odds_of_place
     return (len(before) <= _FEW * len(loops)
             or bool(needed and calmer and _log_odds(told, as_stated) >= enough))
+
+
+def _is_stated(drift: float, given: Evidence) -> bool:
+    """Return whether a drift is within what the odometry states, as a loop is within its gate."""
+    factors = given.factors
+    rows = np.flatnonzero(factors.is_odometry)
+    metres = np.hypot(*factors.measurement[rows, :2].T)
+    turns = drift * metres[:, None] * factors.sqrt_information[rows, :, 2]
+    return bool((turns**2).sum() < given.gate(np.array([1]))[0])
 
 
 def _places(known: Growth, growth: Growth) -> int:

@@ -108,15 +108,17 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         return None
     motion = usual_motion(growth)
     found, most = None, 0.0
-    for steps, odds, state, usual in _tried(growth, as_stated, motion):
+    for steps, odds, costs, state, usual in _tried(growth, as_stated, motion):
         back = _put_back(state, steps, motion) if state else None
+        if back and costs:  # a loop that was chosen shows a slip, or nothing
+            continue
         state, odds = back or (state, odds)
         gain = gain_of_places(growth, as_stated, state) if state and usual else 0.0
         if state and usual and not back and not (state.accepted & ~growth.accepted).any():
             # The noise was learnt of the slip, too, and explains it better than it is.
             odds = max(odds, float(log_odds_of_slips(state, motion)[steps].min()))
         # No slip has to be believed where only a lie had bent the map.
-        evidence = gain if back else odds + gain
+        evidence = gain if back else odds - costs + gain
         if len(steps) == 1:
             growth.slip_odds[steps[0]] = odds if back else evidence
         if state and evidence > most and (usual or (odds > 0 and len(steps) == 1)):
@@ -139,14 +141,14 @@ def _odds_in_the_end(growth: Growth, as_stated: Growth, motion: Motion) -> dict[
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, least: float | None = None
-           ) -> Iterator[tuple[list[int], float, Growth | None, bool]]:
+           ) -> Iterator[tuple[list[int], float, float, Growth | None, bool]]:
     """
-    Yield steps, their log odds to have slipped, the state without them, and whether that is usual.
+    Yield steps, their log odds to have slipped, costs, the state without, whether it is usual.
 
-    None: it falls apart. It is usual if the robot, repaired, moves as elsewhere at each of them.
-    Where it is not, a second step bends what the loops across the first one say: the likeliest
-    are tried, however unlikely each is by itself. Where it is, and the loops say too little, only
-    one that would be suspected now.
+    costs : see `_without`. None: it falls apart. It is usual if the robot, repaired, moves as
+    elsewhere at each of them. Where it is not, a second step bends what the loops across the first
+    one say: the likeliest are tried, however unlikely each is by itself. Where it is, and the
+    loops say too little, only one that would be suspected now.
 
     least : how large the odds against a second step are at most; None: nothing else is cut
     """
@@ -161,17 +163,17 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, least: float | Non
             state, step, usual = _cut_rather(state, step, motion)
         gain = gain_of_places(growth, as_stated, state) if state else 0.0
         if costs and least is None and gain <= costs:  # as if it had fallen apart
-            yield [step], float(odds[step]), None, False
+            yield [step], float(odds[step]), 0.0, None, False
         else:
-            yield [step], float(odds[step]) - costs, state, usual
+            yield [step], float(odds[step]), costs, state, usual
         if state and least is None and (not usual or odds[step] + gain <= costs):
-            for second, other, both, moves in _tried(
+            for second, other, more, both, moves in _tried(
                     state, state, motion, SURE if usual else np.inf):
                 one = step
                 if both:
                     both, one, as_ever = _cut_rather(both, step, motion)
                     moves = moves and as_ever
-                yield [one, *second], float(odds[one]) - costs + other, both, moves
+                yield [one, *second], float(odds[one]) + other, costs + more, both, moves
 
 
 def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> list[int]:
