@@ -333,7 +333,9 @@ def require_the_truth(recording: Recording, heard: Heard) -> None:
     """
     refused, false = heard.refused(recording.loop_stamps), recording.is_false
     if (refused != false).any():
-        raise DemoError(f'expected the {false.sum()} false loops to be refused and no true one')
+        raise DemoError(f'{(refused & false).sum()} false loops are refused and '
+                        f'{(refused & ~false).sum()} true ones, expected all {false.sum()} '
+                        'false ones and no true one')
 
 
 def main() -> int:

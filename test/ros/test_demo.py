@@ -110,7 +110,7 @@ def test_the_demo_fails_unless_it_refuses_the_false_loops_and_no_other(wrong):
         return
     row = np.argmax(recording.is_false == (wrong == 'a false one accepted'))
     heard.states[recording.loop_stamps[row]] = 'accepted' if recording.is_false[row] else 'suspect'
-    with pytest.raises(DemoError, match='expected the 10 false loops to be refused and no true'):
+    with pytest.raises(DemoError, match='expected all 10 false ones and no true one'):
         require_the_truth(recording, heard)
 
 
