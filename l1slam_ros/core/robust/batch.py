@@ -42,7 +42,7 @@ A slip
 A drift
     is an error of all steps, the same on each metre. Where loops are left out, or the odometry is
     far noisier than it says, it is a third explanation, asked before slips: odometry rid of it has
-    to win places or be less noisy (`drift`). Of one learnt as noise the residuals tell (`forecast`).
+    to win places or be less noisy (`drift`). Of one learnt as noise the residuals tell.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
