@@ -221,7 +221,8 @@ def _without(growth: Growth, step: int, motion: Motion) -> tuple[Growth | None, 
     state, span = growth.copy(), growth.given.spanning(step)
     state.cut[step] = True
     state.drops[:] = 0
-    kept, costs = state.copy(), 0.0
+    kept = state.copy()
+    costs = 0.0
     told = (state.accepted & span).any()
     if told:
         state.accepted[span] = state.given.trusted[span]
@@ -244,7 +245,8 @@ def _without(growth: Growth, step: int, motion: Motion) -> tuple[Growth | None, 
 def _join_as_usual(state: Growth, step: int, motion: Motion) -> bool:
     """Join the sides of a step by the loop that shows a slip there rather than lies, or none."""
     given, part = state.given, state.part
-    rows, cut = state.joining(), np.array([step])
+    cut = np.array([step])
+    rows = state.joining()
     rows = asked(state, rows[(part[given.low[rows]] == part[given.low[step]])
                              & (part[given.high[rows]] == part[given.high[step]])
                              & (given.factors.freedom[rows] == len(motion.mean))])
