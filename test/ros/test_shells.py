@@ -27,7 +27,6 @@ from l1slam_ros.ros.shell.arguments import split
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 300.0  # [s] the solver can have to be compiled first
-ONE_MORE = '10 false loops are refused and 1 true ones'
 NOBODYS = 'rmw_of_nobody_cpp'
 # What each of these says would stop a demo, or tests, that take it as it is.
 ODD = {
@@ -123,24 +122,25 @@ def test_the_demo_works_in_an_odd_shell_beside_another_node(python, tmp_path):
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     other = {'ROS_DOMAIN_ID': os.environ['ROS_DOMAIN_ID']}
     python(STAND_IN.replace('other', 'backend'), **other)
-    shown = run(sys.executable, '-m', 'l1slam_ros.ros.executables', cwd=tmp_path, **ODD)
-    # How many loops the scans add hangs on how busy the machine is, and on these whether the gate
-    # refuses one true loop of 601: the demo fails then. Here only the shell is looked at.
-    assert shown.returncode == 0 or ONE_MORE in shown.stderr, shown.stderr
+    # With nothing compiled, as on a new machine, it ends as `.ci/run` wants it, however busy the
+    # machine is: all scans have come before there is a map, on which the loops from scans depend.
+    shown = run(sys.executable, '-m', 'l1slam_ros.ros.executables', cwd=tmp_path,
+                **{**ODD, 'NUMBA_CACHE_DIR': str(tmp_path / 'compiled')})
+    assert shown.returncode == 0, shown.stderr
     (line,) = (line for line in shown.stderr.splitlines() if NOBODYS in line)
     assert line.startswith('demo: ') and line.endswith('is used instead')
     (number,) = re.findall(r'^demo: in ROS domain (\d+), ', shown.stdout, re.MULTILINE)
-    assert number != other['ROS_DOMAIN_ID'] and '10 false loops, ' in shown.stdout
+    assert number != other['ROS_DOMAIN_ID'] and '10 false loops, 0 true ones' in shown.stdout
     assert (tmp_path / 'demo' / 'map.png').exists()
 
 
 def test_the_tests_work_in_an_odd_shell():
-    """One that reads what processes say, and talks to them."""
+    """Two that read what processes say, and talk to them."""
     tests = ROOT / 'test' / 'ros' / 'test_processes.py'
     ran = run(sys.executable, '-m', 'pytest', '-p', 'no:cacheprovider', tests, '-k',
-              'a_map_comes_out', **ODD, ROS_DOMAIN_ID='7')
+              'a_map_comes_out or loses_neither', **ODD, ROS_DOMAIN_ID='7')
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert '1 passed' in ran.stdout and f'{NOBODYS}, which cannot be loaded here' in ran.stdout
+    assert '2 passed' in ran.stdout and f'{NOBODYS}, which cannot be loaded here' in ran.stdout
 
 
 @pytest.mark.parametrize('ask', ['--help', '-h'])
