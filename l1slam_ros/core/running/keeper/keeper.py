@@ -13,8 +13,7 @@ In: messages, and results computed from snapshots. Out: snapshots, and the revis
 counts all changes and tells whether a stored result is still up to date.
 
     _front_lock     the front and its bordered systems, while factors are added or steps computed
-    _graph_lock     graph, odometry, loops, state and revision: held briefly, so that messages
-                    never wait
+    _graph_lock     graph, odometry, loops, state, revision: held briefly; messages never wait
 
 A thread that needs both takes them in this order; neither is held while solving, or while a file
 is read or written. The state changes under both locks, or under the graph lock alone where a map
@@ -197,8 +196,7 @@ class Keeper:
                 yield Snapshot(
                     self._state, builder.graph.copy(), builder.keyframe_stamps,
                     builder.keyframe_poses, self._odom_of(0).now(builder.robots[0]), loops.rows,
-                    loops.stamps, loops.robots, views,
-                    front.pattern if front and views else None)
+                    loops.stamps, loops.robots, views, front.pattern if front and views else None)
 
     def saved(self) -> SavedMap | None:
         """See `Backend.saved`."""
@@ -255,14 +253,16 @@ class Keeper:
         """
         with self._front_lock, self._graph_lock:
             self._add_due_loops()
+        taken = False
         took = 0.0  # [s] by the factors before, if any
         while (now := time.monotonic()) + took < deadline and not in_vain():
             with self._front_lock:
                 if not self._take_some():
                     break
+            taken = True
             self._front_lock.let_others()  # else they would wait for the deadline
             took = time.monotonic() - now
-        if took:
+        if taken:
             with self._front_lock:
                 with self._graph_lock:
                     front, state, seen = self._front, self._state, Seen.of(self._builder)
