@@ -85,7 +85,8 @@ def _ends(path: str | os.PathLike[str]) -> tuple[bytes, bytes]:
 
 
 def refuse_others(outputs: Iterable[str | os.PathLike[str]],
-                  inputs: Iterable[str | os.PathLike[str]] = (), force: bool = False) -> None:
+                  inputs: Iterable[str | os.PathLike[str]] = (), force: bool = False,
+                  instead: str = 'another name, or --force') -> None:
     """
     Refuse outputs that would replace an input or a file of another program.
 
@@ -94,6 +95,7 @@ def refuse_others(outputs: Iterable[str | os.PathLike[str]],
     outputs : all files that will be written or removed
     inputs : all files that may be read; none may be an output, not even under another name
     force : whether to replace files of other programs
+    instead : what was expected of a name that is taken
 
     Raises
     ------
@@ -110,7 +112,7 @@ def refuse_others(outputs: Iterable[str | os.PathLike[str]],
                                 'expected another name')
         if not force and os.path.exists(output) and not is_ours(output):
             raise FileError(output, f'was not written by {PROGRAM}, so it is not overwritten; '
-                            'expected another name, or --force')
+                            f'expected {instead}')
 
 
 def _is_part(output: str | os.PathLike[str], path: str | os.PathLike[str]) -> bool:

@@ -13,7 +13,6 @@ The first row of the picture has the greatest y. With `negate: 0` white is free:
 free, 205 unknown, 0 occupied.
 """
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ import numpy as np
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.scans.occupancy.grid import Grid
 from l1slam_ros.io.files import replacing, require_file, write_lines
-from l1slam_ros.io.ours import MARK, PROGRAM, is_ours, marked, refuse_others
+from l1slam_ros.io.ours import MARK, marked, refuse_others
 
 _FREE = 254
 _UNKNOWN = 205
@@ -42,21 +41,6 @@ def check_grid(path: Path, inputs: list[Path], force: bool = False) -> None:
     for file in (path, beside(path)):
         require_file(file)
     refuse_others((path, beside(path)), inputs, force)
-
-
-def require_own(path: Path) -> None:
-    """
-    Refuse to replace a grid, or the .yaml beside it, that another program or a person made.
-
-    Raises
-    ------
-    FileError : naming the first such file, or one that cannot be read.
-
-    """
-    for file in (path, beside(path)):
-        if os.path.exists(file) and not is_ours(file):
-            raise FileError(file, f'was not written by {PROGRAM}, so it is not overwritten; '
-                            'expected another map_path')
 
 
 def write_grid(path: Path, grid: Grid) -> None:

@@ -24,7 +24,8 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.occupancy.live_grid import LiveGrid
 from l1slam_ros.core.scans.points import Points
 from l1slam_ros.io.files import counted
-from l1slam_ros.io.scans.grid_file import require_own, write_grid
+from l1slam_ros.io.ours import refuse_others
+from l1slam_ros.io.scans.grid_file import beside, write_grid
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
 from l1slam_ros.ros.shell.header import header
 
@@ -103,7 +104,7 @@ class MapDrawer:
         path = self._options().map_path
         if not path:
             raise OptionError('map_path is empty, expected the name of a .pgm file')
-        require_own(Path(path))
+        refuse_others((path, beside(Path(path))), instead='another map_path')
         with self._lock:
             self._draw(float('inf'))
             drawn = len(self._grid)
