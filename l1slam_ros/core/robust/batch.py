@@ -125,7 +125,6 @@ def robust_solve(
         for number, growth in enumerate(rounds(first, repair), 1):
             so_far = _so_far(growth, repair.drift)
             report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
-        growth.accept_tail()
         judgement = judgement_of(growth, doubts(growth, number < _MOST_ROUNDS, repair.rival))
         return replace(judgement, drift=repair.drift), growth.poses
     except _FAILURES as error:
@@ -297,7 +296,9 @@ def rounds(
     growth: Growth, repaired: Callable[[Growth, Growth], Growth | None] | None = None
 ) -> Iterator[Growth]:
     """
-    Yield the state after each round, until there is nothing more to accept.
+    Yield the state after each round, until there is nothing more to accept but the noise's tail.
+
+    That comes in after the last one, into the state that was yielded last.
 
     repaired : asked in the end for another state, from the one with the noise as it was found and
     the one where all may be as noisy as they say; None: there is none, or nobody looks for one.
@@ -321,6 +322,7 @@ def rounds(
                 growth = other
                 found = None
         yield growth
+    growth.accept_tail()
 
 
 def judge(
@@ -350,8 +352,6 @@ def judge(
             if time.monotonic() > deadline and not growth.noise.at_their_word:
                 settled = False
                 break
-        if settled:
-            growth.accept_tail()
         reasons = doubts(growth) if settled else ()
         return replace(judgement_of(growth, reasons, settled), drift=known.drift), growth.poses
     except _FAILURES as error:

@@ -20,6 +20,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.robust.innovation import spread_of
+from l1slam_ros.core.robust.odometry.drift import drift_turn
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
@@ -107,12 +108,7 @@ def left_drift(growth: Growth) -> tuple[float, float]:
         return 0.0, 0.0
     rows = np.flatnonzero(growth.accepted)
     at = np.flatnonzero(~(growth.given.is_loop | growth.cut)[rows])
-    steps = rows[at]
-    factors = growth.given.factors
-    turn = np.zeros((len(at), 3))
-    turn[:, 2] = np.hypot(*factors.measurement[steps, :2].T)
-    noise = growth.noise.assumed
-    turn = np.einsum('mij,mj->mi', factors.sqrt_information[steps], turn) / np.sqrt(noise[0])
+    turn = drift_turn(growth.given.factors, rows[at]) / np.sqrt(growth.noise.assumed[0])
     found = float((turn * growth.posterior.residual[at]).sum())
     by_noise = np.einsum('mi,miq->q', turn, growth.posterior.left_over(at))
     variance = float((by_noise**2).mean())

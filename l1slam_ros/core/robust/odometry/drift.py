@@ -24,6 +24,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL, log_prior
 from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES, Evidence
@@ -58,6 +59,13 @@ def corrected(factors: BetweenFactors, rows: Indices, drift: float) -> Array:
     step = np.zeros((len(rows), 3))
     step[:, 2] = drift * along * np.hypot(measured[:, 0], measured[:, 1])
     return se2.retract(measured, step)
+
+
+def drift_turn(factors: BetweenFactors, rows: Indices) -> Array:
+    """Return by how much some odometry factors turn for a drift of 1 rad/m, whitened, (k, 3)."""
+    turn = np.zeros((len(rows), 3))
+    turn[:, 2] = np.hypot(*factors.measurement[rows, :2].T)
+    return whiten(factors.sqrt_information[rows], turn)
 
 
 @dataclass(frozen=True)
@@ -143,10 +151,8 @@ def _explains(straight: Straight, as_stated: Growth) -> bool:
 def _is_stated(drift: float, given: Evidence) -> bool:
     """Return whether a drift is within what the odometry states, as a loop is within its gate."""
     factors = given.factors
-    rows = np.flatnonzero(factors.is_odometry)
-    metres = np.hypot(*factors.measurement[rows, :2].T)
-    turns = drift * metres[:, None] * factors.sqrt_information[rows, :, 2]
-    return bool((turns**2).sum() < given.gate(np.array([1]))[0])
+    turn = drift * drift_turn(factors, np.flatnonzero(factors.is_odometry))
+    return bool((turn**2).sum() < given.gate(np.array([1]))[0])
 
 
 def _places(known: Growth, growth: Growth) -> int:

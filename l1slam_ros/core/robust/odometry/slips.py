@@ -140,7 +140,7 @@ def _odds_in_the_end(growth: Growth, as_stated: Growth, motion: Motion) -> dict[
     return {step: max(odds, growth.slip_odds.get(step, odds)) for step, odds in last.items()}
 
 
-def _tried(growth: Growth, as_stated: Growth, motion: Motion, least: float | None = None
+def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None = None
            ) -> Iterator[tuple[list[int], float, float, Growth | None, bool]]:
     """
     Yield steps, their log odds to have slipped, costs, the state without, whether it is usual.
@@ -150,25 +150,24 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, least: float | Non
     one say: the likeliest are tried, however unlikely each is by itself. Where it is, and the
     loops say too little, only one that would be suspected now.
 
-    least : how large the odds against a second step are at most; None: nothing else is cut
+    after : whether the first step that was cut is usual; None: this one is the first
     """
     odds, left_out = log_odds_of_slips(growth, motion), as_stated.undecided()
     # Where loops are left out, one more place may be won.
     most = max(SURE, growth.given.log_odds_of_place) if len(left_out) else SURE
-    groups = left_out[:0] if least == SURE else left_out
-    for step in _suspected(growth, odds, groups, most if least is None else least):
+    least = most if after is None else SURE if after else np.inf
+    for step in _suspected(growth, odds, left_out[:0] if after else left_out, least):
         state, costs = _without(growth, step, motion)
         usual = False
         if state:
             state, step, usual = _cut_rather(state, step, motion)
         gain = gain_of_places(growth, as_stated, state) if state else 0.0
-        if costs and least is None and gain <= costs:  # as if it had fallen apart
+        if costs and after is None and gain <= costs:  # as if it had fallen apart
             yield [step], float(odds[step]), 0.0, None, False
         else:
             yield [step], float(odds[step]), costs, state, usual
-        if state and least is None and (not usual or odds[step] + gain <= costs):
-            for second, other, more, both, moves in _tried(
-                    state, state, motion, SURE if usual else np.inf):
+        if state and after is None and (not usual or odds[step] + gain <= costs):
+            for second, other, more, both, moves in _tried(state, state, motion, usual):
                 one = step
                 if both:
                     both, one, as_ever = _cut_rather(both, step, motion)
