@@ -128,8 +128,9 @@ def _refuse(sentence: str) -> int:
 
 def _add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--force', action='store_true',
-                        help='replace an existing output even if l1slam did not write it; an '
-                        'input is never replaced')
+                        help='replace an existing output even if l1slam did not write it; a '
+                        'folder that is no bag is kept beside it, under the time of its last '
+                        'change; an input is never replaced')
 
 
 def _add_reading(parser: argparse.ArgumentParser) -> None:

@@ -10,11 +10,12 @@
 
 import os
 import secrets
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
-from itertools import chain, islice
+from itertools import chain, count, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 
@@ -93,6 +94,14 @@ def new_folder_beside(target: Path) -> Iterator[Path]:
     with TemporaryDirectory('.tmp', f'.{target.name}.', target.absolute().parent,
                             ignore_cleanup_errors=True) as folder:
         yield Path(folder)
+
+
+def dated_names(path: Path, of: Path) -> Iterator[Path]:
+    """Yield names like `of`, with the time of the last change of `path`, then a number, too."""
+    name = f'{of.stem}.{time.strftime("%Y-%m-%dT%H-%M-%S", time.localtime(path.stat().st_mtime))}'
+    yield of.with_name(f'{name}{of.suffix}')
+    for number in count(2):
+        yield of.with_name(f'{name}.{number}{of.suffix}')
 
 
 def sync_folder(folder: Path) -> None:

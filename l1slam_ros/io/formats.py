@@ -190,10 +190,9 @@ def check_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
         require_file(path)
     else:
         with optional_libraries():
-            from l1slam_ros.io.bags.writer import refuse_other_than_bag
+            import l1slam_ros.io.bags.writer  # noqa: F401
 
         require_folder(path)
-        refuse_other_than_bag(path)
     if suffix in ('.g2o', *JRL_SUFFIXES):
         also = (*WRITTEN_BESIDE, *also)
     refuse_others([path, *(beside(path, what) for what in also)], inputs, force)
@@ -289,7 +288,8 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     inliers : (m,) bool, as in a `Solution`: the other factors are written such that other programs
         do not use them. None: the inliers of the solution with these poses; without one, the
         factors that were left out in the file that was read stay left out
-    force : whether to replace a file that this program did not write
+    force : whether to replace what this program did not write; a folder that is no bag is kept
+        beside the new one, under the time of its last change
 
     Raises
     ------

@@ -25,9 +25,8 @@ import yaml
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.bags.damaged.salvage import METADATA
-from l1slam_ros.io.files import new_folder_beside, reported, sync_folder
+from l1slam_ros.io.files import dated_names, new_folder_beside, reported, sync_folder
 
 NOTE_KEY = 'l1slam'
 # Suffixes of the other files in the directory of a bag.
@@ -100,12 +99,13 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
 
     Parameters
     ----------
-    path : a bag already there is replaced once the new one is complete
+    path : a bag already there is replaced once the new one is complete; anything else that is
+        there is kept beside it, under its name and the time of its last change
     note : what `read_note` will return
 
     Raises
     ------
-    FileError : the bag cannot be written, or something that is no bag is in its place.
+    FileError : the bag cannot be written.
 
     """
     target = Path(os.path.realpath(path))
@@ -136,34 +136,29 @@ def _yaml(document: Any, in_one_line: bool = False) -> str:
                          default_flow_style=in_one_line)).strip()
 
 
-def refuse_other_than_bag(target: Path) -> None:
-    """Refuse to replace what exists at `target`, unless it is a bag and nothing else."""
-    if not os.path.lexists(target):
-        return
-    if not (target / METADATA).is_file():
-        raise FileError(target, 'exists and is not a bag, so it is not overwritten; expected a '
-                        'bag or nothing there')
-    for child in sorted(target.iterdir()):
-        if child.name != METADATA and not child.name.endswith(_BAG_SUFFIXES):
-            raise FileError(target, f'holds {child.name}, which is not part of a bag, so it is '
-                            'not overwritten; expected a bag or nothing there')
-
-
 @contextmanager
 def _replacing_directory(target: Path) -> Iterator[Path]:
     """Yield the name of a directory that replaces `target` when the block succeeds."""
-    with reported(target):
-        refuse_other_than_bag(target)
-        with new_folder_beside(target) as scratch:
-            # Under its final name, which the file inside repeats.
-            made = scratch / target.name
-            yield made
-            for file in made.iterdir():
-                with file.open('rb') as written:
-                    os.fsync(written.fileno())
-            sync_folder(made)
-            _swap(made, target, scratch / f'{target.name}.former')
-            sync_folder(target.parent)
+    with reported(target), new_folder_beside(target) as scratch:
+        # Under its final name, which the file inside repeats.
+        made = scratch / target.name
+        yield made
+        for file in made.iterdir():
+            with file.open('rb') as written:
+                os.fsync(written.fileno())
+        sync_folder(made)
+        # What is no bag is not removed with the scratch folder: it may be a person's work.
+        kept = os.path.lexists(target) and not _is_bag(target)
+        _swap(made, target, next(name for name in dated_names(target, target)
+                                 if not os.path.lexists(name))
+              if kept else scratch / f'{target.name}.former')
+        sync_folder(target.parent)
+
+
+def _is_bag(path: Path) -> bool:
+    """Tell whether a directory is a bag and holds nothing else."""
+    return (path / METADATA).is_file() and all(
+        child.name == METADATA or child.name.endswith(_BAG_SUFFIXES) for child in path.iterdir())
 
 
 def _swap(made: Path, target: Path, former: Path) -> None:

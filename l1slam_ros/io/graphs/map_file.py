@@ -21,7 +21,7 @@ from pathlib import Path
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.core.running.snapshot import SavedMap
-from l1slam_ros.io.files import other_kind
+from l1slam_ros.io.files import dated_names, other_kind
 from l1slam_ros.io.formats import named
 from l1slam_ros.io.graphs.saved_map import before_of, is_map, keep_as, load_map, save_map
 from l1slam_ros.io.node_options import NodeOptions
@@ -249,18 +249,10 @@ def _end_of(path: Path) -> bytes:
 
 def _kept(path: Path, of: Path) -> list[str]:
     """Rename a file after its date; return a sentence, or none if such a copy exists already."""
-    name = f'{of.stem}.{_time_of(path)}'
-    number = 1
-    kept = of.with_name(f'{name}{of.suffix}')
-    while os.path.lexists(kept):
+    for kept in dated_names(path, of):
+        if not os.path.lexists(kept):
+            break
         if os.path.isfile(kept) and filecmp.cmp(path, kept, shallow=False):
             return []
-        number += 1
-        kept = of.with_name(f'{name}.{number}{of.suffix}')
     keep_as(path, kept)
     return [f'{path} held another map: it is kept as {kept}']
-
-
-def _time_of(path: Path) -> str:
-    """Return the time of the last change of a file, as a part of a name."""
-    return time.strftime('%Y-%m-%dT%H-%M-%S', time.localtime(path.stat().st_mtime))

@@ -174,17 +174,21 @@ def test_a_power_cut_after_a_bag_is_written_takes_none_of_it(tmp_path, bag, monk
         assert kept == contents(bag)
 
 
-def test_what_is_no_bag_is_not_overwritten(tmp_path, bag):
+def test_what_is_no_bag_is_kept_beside_the_bag_that_takes_its_place(tmp_path, bag):
     (tmp_path / 'file').write_text('precious')
     (tmp_path / 'folder').mkdir()
     (tmp_path / 'folder' / 'precious').touch()
     (bag / 'precious.txt').touch()
-    for name in ('file', 'folder', 'bag'):
-        with pytest.raises(FileError, match='not overwritten; expected a bag or nothing there'):
-            write_strings(tmp_path / name)
-    assert (tmp_path / 'file').read_text() == 'precious'
-    assert (bag / 'precious.txt').exists()
-    assert {p.name for p in tmp_path.iterdir()} == {'file', 'folder', 'bag'}
+    before = {name: contents(tmp_path / name) for name in ('folder', 'bag')}
+    for name in ('file', 'folder', 'bag', 'folder'):
+        write_strings(tmp_path / name)
+        assert contents(tmp_path / name).keys() == {'metadata.yaml', f'{name}.mcap'}
+    kept = {name: list(tmp_path.glob(f'{name}.*')) for name in ('file', 'folder', 'bag')}
+    # The bag that the second one replaced in `folder` was written by this program: it is gone.
+    assert [len(names) for names in kept.values()] == [1, 1, 1]
+    assert kept['file'][0].read_text() == 'precious'
+    assert {name: contents(kept[name][0]) for name in before} == before
+    assert len(list(tmp_path.iterdir())) == 6
 
 
 def test_what_a_link_leads_to_is_replaced(tmp_path, bag):
