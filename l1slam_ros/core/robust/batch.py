@@ -213,11 +213,10 @@ def minimise_robustly(
     """
     judgement, poses = robust_solve(graph, report, check, known)
     try:
-        whole, least = _least_squares(graph, judgement, poses, check)
-        solution = minimise(whole, least.poses)
-        seed = least.poses
+        whole, seed = _least_squares(graph, judgement, poses, check)
+        solution = minimise(whole, seed)
         check()
-        more = least.doubts(graph, judgement, solution.poses)
+        more = _norm_doubts(graph, judgement, whole, seed, solution.poses)
     except _FAILURES as error:
         solution = _standing(judgement.believed(graph), poses)
         seed = poses
@@ -245,51 +244,44 @@ def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
     if not len(graph.between):  # of nothing: compiled loops would go past its arrays
         return ()
     try:
-        return _least_squares(graph, judgement, poses, check)[1].doubts(graph, judgement, poses)
+        whole, seed = _least_squares(graph, judgement, poses, check)
+        return _norm_doubts(graph, judgement, whole, seed, poses)
     except _FAILURES as error:
         return (_unsolved(graph, judgement, error),)
 
 
-@dataclass(frozen=True)
-class _LeastSquares:
-    """The L2 map (n, p) of the accepted factors, and its covariances, of all but those held."""
-
-    poses: Array
-    covariances: Array
-
-    def doubts(self, graph: FactorGraph, judgement: Judgement,
-               poses: Array) -> tuple[Doubt, ...]:
-        """
-        Return a doubt where half of a map, (n, p), is further off this one than noise makes it.
-
-        Of normal noise, as it was found, the difference has pi/2 - 1 of the covariance of the L2
-        map at most, which is what L1 pays for it. Of the keyframes of one way all may err
-        together. No doubt where either map is right if the other one is.
-        """
-        manifold = graph.manifold
-        held = len(poses) - len(self.covariances)
-        ours = manifold.positions(poses)
-        other = manifold.positions(self.poses)
-        if absolute_trajectory_error(ours, other) < right_within(other):
-            return ()
-        step = manifold.local(self.poses, poses)[held:]
-        square = kernels.prediction.normalise(self.covariances, step)[0]
-        explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
-        if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
-            return ()
-        loops = graph.between.pairs[judgement.accepted & ~graph.between.is_odometry]
-        return (Doubt(NORM, len(loops), 0, graph.n_poses - 1, pairs=listed(loops)),)
-
-
 def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,
-                   check: Callable[[], None]) -> tuple[FactorGraph, _LeastSquares]:
-    """Return the accepted factors, in one piece, and their L2 map, from poses (n, p)."""
+                   check: Callable[[], None]) -> tuple[FactorGraph, Array]:
+    """Return the accepted factors, in one piece, and their L2 map (n, p), from poses (n, p)."""
     whole = tied(judgement.believed(graph), poses)
-    cholesky = cholesky_of(whole)
-    seed = l2_map(whole, poses, cholesky, lambda *_: check())
+    return whole, l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
+
+
+def _norm_doubts(graph: FactorGraph, judgement: Judgement, whole: FactorGraph, seed: Array,
+                 poses: Array) -> tuple[Doubt, ...]:
+    """
+    Return a doubt where half of a map, (n, p), is further off the L2 map than noise makes it.
+
+    Of normal noise, as it was found, the difference has pi/2 - 1 of the covariance of the L2 map
+    at most, which is what L1 pays for it. Of the keyframes of one way all may err together. No
+    doubt where either map is right if the other one is.
+
+    whole, seed : see `_least_squares`
+    """
+    manifold = graph.manifold
+    other = manifold.positions(seed)
+    if absolute_trajectory_error(manifold.positions(poses), other) < right_within(other):
+        return ()
     noise = judgement.found_variance(graph)
     noise = np.concatenate((noise, np.ones(len(whole.between) - len(noise))))
-    return whole, _LeastSquares(seed, covariances(spread_of(whole, seed, cholesky, noise)))
+    spread = covariances(spread_of(whole, seed, cholesky_of(whole), noise))
+    step = manifold.local(seed, poses)[len(poses) - len(spread):]
+    square = kernels.prediction.normalise(spread, step)[0]
+    explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
+    if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
+        return ()
+    loops = graph.between.pairs[judgement.accepted & ~graph.between.is_odometry]
+    return (Doubt(NORM, len(loops), 0, graph.n_poses - 1, pairs=listed(loops)),)
 
 
 def rounds(

@@ -137,7 +137,11 @@ def solve(
         seed = _seed(graph, method) if asked.start == 'seed' else None
         solution = minimiser.minimise_by(method, graph, initial if seed is None else seed)
     seconds = time.perf_counter() - began
-    cost = cost_function(graph, asked)
+    norm = norm_for(graph, asked.norm, asked.loop_norm, asked.least_squares.huber_delta)
+
+    def cost(poses: Array) -> float:
+        return norm.cost(whitened_residual(graph, poses))
+
     seed_cost = None if seed is None else cost(seed)
     if robust:
         # Whatever the noise is, and whatever failed: of the norm, by what the file says of it.
@@ -230,12 +234,6 @@ def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Arr
                          for one in np.ascontiguousarray(b.T)], axis=1)
 
     return lacked_step(part, is_loop, system.b, np.ones(2), left_of)
-
-
-def cost_function(graph: FactorGraph, asked: SolveOptions) -> Callable[[Array], float]:
-    """Return what is to be minimised, as a function of the poses."""
-    norm = norm_for(graph, asked.norm, asked.loop_norm, asked.least_squares.huber_delta)
-    return lambda poses: norm.cost(whitened_residual(graph, poses))
 
 
 def _require_start(graph: FactorGraph, stored: Array | None, asked: SolveOptions,

@@ -35,9 +35,8 @@ Ends = tuple[Indices, Indices, Array]
 ASKED = 250
 # Of each one so many pairs are looked at closely, those that differ least.
 _NEAREST = 20
-# A run has so many loops, each agrees with so many others of it, and it is so long [m].
+# A run has so many loops, each agrees with half as many others of it, and it is so long [m].
 RUN = 6
-_MATES = 3
 _RUN_WAY = 2.5
 # One that is to outweigh the odometry has so many: of recorded ones five in six are true then.
 _LONG_RUN = 10
@@ -106,7 +105,7 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
     found = []
     for number in np.unique(place):
         own = np.flatnonzero(place == number)
-        own = own[count[own] >= _MATES]
+        own = own[2 * count[own] >= RUN]
         ways = [np.ptp(poses[ends[rows[own]]], axis=0).max(initial=0.0)
                 for ends in (given.low, given.high)] if len(own) >= RUN else [0.0]
         if min(ways) > _RUN_WAY:

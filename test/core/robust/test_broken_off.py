@@ -112,7 +112,7 @@ def test_nor_is_the_norm_asked_of_a_map_that_cannot_be_factored(bad, monkeypatch
     def failing(*_):
         raise GraphError(WHY)
 
-    monkeypatch.setattr(batch, 'covariances', failing)
+    monkeypatch.setattr(batch, 'l2_map', failing)
     doubt, = doubts_of_norm(bad.graph, judgement, poses, lambda: None)
     assert (doubt.kind, doubt.detail) == (UNSOLVED, WHY)
 
@@ -121,7 +121,7 @@ def test_the_account_is_of_the_map_there_is(bad, monkeypatch):
     def failing(*_):
         raise GraphError(WHY)
 
-    monkeypatch.setattr(batch, 'covariances', failing)
+    monkeypatch.setattr(batch, 'l2_map', failing)
     outcome = solve(bad.graph, None, SolveOptions(norm='l2'))
     believed = whitened_residual(bad.graph.subset(outcome.judgement.accepted),
                                  outcome.solution.poses)

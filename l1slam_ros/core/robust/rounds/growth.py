@@ -242,7 +242,6 @@ class Growth:
 
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
-        noise_fits = self.noise.is_known(self.accepted)
         while True:
             vars(self).pop('posterior', None)  # nearly as large as the factor that is made now
             if self.cut.any():
@@ -255,17 +254,12 @@ class Growth:
             self.poses, residual, solved = l2_optimum(subgraph, self.poses, cholesky,
                                                       lambda *_: self._check())
             self._check()
-            # What is far goes by its residual alone: to sample takes longer than to solve.
-            residual = residual.reshape(len(rows), -1)
-            misfits = self._misfits(rows, residual) if noise_fits else rows[:0]
+            self.posterior = sample_posterior(subgraph, self.poses, cholesky, solved)
+            if self._is_noisier(rows):
+                continue
+            misfits = self._misfits(rows, residual.reshape(len(rows), -1))
             if not len(misfits):
-                self.posterior = sample_posterior(subgraph, self.poses, cholesky, solved)
-                if self._is_noisier(rows):
-                    continue
-                noise_fits = True
-                misfits = self._misfits(rows, residual, self.posterior.left_out())
-                if not len(misfits):
-                    break
+                break
             self.accepted[misfits] = False
             self.drops[misfits] += 1
         if not self.noise.is_known(self.accepted):
@@ -285,12 +279,12 @@ class Growth:
         self.noise = self.noise.found(np.where(noisier, scale, 1.0) * self.noise.variance)
         return bool(noisier.any())
 
-    def _misfits(self, rows: Indices, residual: Array, against: Array | float = 0.0) -> Indices:
+    def _misfits(self, rows: Indices, residual: Array) -> Indices:
         """Return the accepted loops that do not fit, or that all others speak against."""
         freedom = self.given.factors.freedom[rows]
         may_go = self.given.is_loop[rows] & ~self.given.trusted[rows]
         far = (residual**2).sum(axis=1) > chi2_quantile(1 - _DROPPED, freedom)
-        against = np.where(may_go, against, 0.0)
+        against = np.where(may_go, self.posterior.left_out(), 0.0)
         # Next to a false loop the true ones look bad too: only the worst go.
         doubted = self.given.gate(freedom, DOUBT / len(rows))
         far |= against > np.maximum(doubted, against.max(initial=0.0) / 2)
