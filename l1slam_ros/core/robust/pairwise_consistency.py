@@ -27,7 +27,7 @@ from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.innovation import claimed_volume, log_claims, log_likelihood_ratio
-from l1slam_ros.core.robust.rounds.growth import Growth
+from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 
 # First ends, second ends and measurements of loops.
 Ends = tuple[Indices, Indices, Array]
@@ -112,6 +112,22 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
             order = np.argsort(-count[own], kind='stable')
             found.append(Group(rows[own[order]], np.array([number])))
     return found
+
+
+def gain_of(growth: Growth, as_stated: Growth, cut: Growth) -> float:
+    """
+    Return what places and runs say that are won and lost by a cut, ln of odds.
+
+    A robot that goes the same way again and again sees one place all along: that is won before,
+    however many of its loops are refused. So a run of these counts as a place does.
+    """
+    is_loop, place = growth.given.is_loop, growth.given.place
+    before, after = growth.accepted & is_loop, cut.accepted & is_loop
+    more = np.flatnonzero(
+        after & ~before & ~as_stated.accepted & np.isin(place, place[before]))
+    less = np.flatnonzero(before & ~after & np.isin(place, place[after]))
+    won = len(runs(cut, more)) - len(runs(growth, less))
+    return gain_of_places(growth, as_stated, cut) + growth.given.log_odds_of_place * won
 
 
 def agree_at_a_place(growth: Growth, rows: Indices) -> Indices:

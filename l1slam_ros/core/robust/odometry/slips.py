@@ -39,6 +39,7 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     Group,
     asked,
     by_pair_of_parts,
+    gain_of,
     longest_run,
     spanned,
     strongest_across,
@@ -113,7 +114,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if back and costs:  # a loop that was chosen shows a slip, or nothing
             continue
         state, odds = back or (state, odds)
-        gain = gain_of_places(growth, as_stated, state) if state and usual else 0.0
+        gain = gain_of(growth, as_stated, state) if state and usual else 0.0
         if state and usual and not back and not (state.accepted & ~growth.accepted).any():
             # The noise was learnt of the slip, too, and explains it better than it is.
             odds = max(odds, float(log_odds_of_slips(state, motion)[steps].min()))
@@ -271,11 +272,7 @@ def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
 
 
 def _cut_rather(state: Growth, cut: int, motion: Motion) -> tuple[Growth, int, bool]:
-    """
-    Return the state cut at the likeliest step between the same loops; that; whether usual.
-
-    That is, whether the robot, repaired, moves there as elsewhere.
-    """
+    """Return the state cut at the likeliest step between the same loops; that; whether usual."""
     step = _likeliest(state, cut, motion)
     if step != cut:
         state = _cut_at(state, cut, step)
