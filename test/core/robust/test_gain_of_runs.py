@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
 from l1slam_ros.core.robust import pairwise_consistency
 from l1slam_ros.core.robust.pairwise_consistency import NO_GROUP, gain_of
 
