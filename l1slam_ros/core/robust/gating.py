@@ -106,7 +106,7 @@ def believable(
     well = (found.square < gate(found.freedom) / 2) & many
     good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits], place[fits],
                                                  well[fits])]
-    if len(good) <= _FEW * len(fits) * many:
+    if len(good) <= _FEW * len(fits):
         more = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
         good = np.union1d(good, more)
     return good
@@ -158,7 +158,8 @@ def together(found: Innovations, posterior: Posterior, gate: Gate,
     one, other, square, both = _pairs(found, posterior, np.flatnonzero(fits), log_ratio, place)
     far = np.zeros(len(fits))
     agree = square < gate(found.freedom[one] + found.freedom[other])
-    gain = both - log_ratio[one] - np.maximum(odds[other], 0.0)
+    gain = (np.logaddexp(0.0, both - log_ratio[one] - odds[other])
+            - np.logaddexp(0.0, log_ratio[other] - odds[other]))
     np.maximum.at(far, one[agree], gain[agree])
     believed: Indices = np.flatnonzero(
         (log_ratio + far > odds + np.log(1 / DOUBT - 1)) & (far > 0))
