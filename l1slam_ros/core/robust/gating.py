@@ -36,8 +36,7 @@ _FALSE_PLACES = 1e-3
 # claim, sphere2500 kept lies. Where half lie, it takes as few rounds as without this.
 _MOST_LIE = np.log(2)
 # Where no more than this part of all are believed by themselves, others are for what they say
-# together, or a large map that is not sure of itself would grow by a loop or two a round; likewise
-# only where few lie: with 95% lies half of what came in was false.
+# together, or a large map that is not sure of itself would grow by a loop or two a round.
 _FEW = 2e-3
 # The noise is judged by so many of the best predicted factors; half and double make none worse.
 _BEST_PREDICTED = 1000
@@ -144,8 +143,9 @@ def together(found: Innovations, posterior: Posterior, gate: Gate,
     """
     Return which factors may be believed for what others say that fit, (k,).
 
-    To the log ratio of a factor a comes that of the best one b of another place, given a, less the
-    odds that b is false by chance too.
+    The best factor b of another place speaks for a as far as a makes it likelier. If b is false
+    with the log odds o, what it says is 1 + exp(log ratio of b, o less) times as likely as chance;
+    if a is true, 1 + exp(log ratio of b given a, o less). Of their ratio the logarithm is added.
 
     Parameters
     ----------
