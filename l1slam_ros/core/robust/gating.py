@@ -36,8 +36,7 @@ _FALSE_PLACES = 1e-3
 # claim, sphere2500 kept lies. Where half lie, it takes as few rounds as without this.
 _MOST_LIE = np.log(2)
 # Where no more than this part of all are believed by themselves, others are for what they say
-# together, or a large map that is not sure of itself would grow by a loop or two a round; likewise
-# only where few lie: with 95% lies half of what came in was false.
+# together, or a large map that is not sure of itself would grow by a loop or two a round.
 _FEW = 2e-3
 # The noise is judged by so many of the best predicted factors; half and double make none worse.
 _BEST_PREDICTED = 1000
@@ -106,7 +105,7 @@ def believable(
     well = (found.square < gate(found.freedom) / 2) & many
     good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits], place[fits],
                                                  well[fits])]
-    if len(good) <= _FEW * len(fits) * many:
+    if len(good) <= _FEW * len(fits):
         more = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
         good = np.union1d(good, more)
     return good
@@ -144,8 +143,9 @@ def together(found: Innovations, posterior: Posterior, gate: Gate,
     """
     Return which factors may be believed for what others say that fit, (k,).
 
-    To the log ratio of a factor a comes that of the best one b of another place, given a, less the
-    odds that b is false by chance too.
+    The best factor b of another place speaks for a as far as a makes it likelier. If b is false
+    with the log odds o, what it says is 1 + exp(log ratio of b, o less) times as likely as chance;
+    if a is true, 1 + exp(log ratio of b given a, o less). Of their ratio the logarithm is added.
 
     Parameters
     ----------
@@ -158,7 +158,8 @@ def together(found: Innovations, posterior: Posterior, gate: Gate,
     one, other, square, both = _pairs(found, posterior, np.flatnonzero(fits), log_ratio, place)
     far = np.zeros(len(fits))
     agree = square < gate(found.freedom[one] + found.freedom[other])
-    gain = both - log_ratio[one] - np.maximum(odds[other], 0.0)
+    gain = (np.logaddexp(0.0, both - log_ratio[one] - odds[other])
+            - np.logaddexp(0.0, log_ratio[other] - odds[other]))
     np.maximum.at(far, one[agree], gain[agree])
     believed: Indices = np.flatnonzero(
         (log_ratio + far > odds + np.log(1 / DOUBT - 1)) & (far > 0))

@@ -47,14 +47,14 @@ SURE = np.diag([1e4, 1e4, 1e6])
 ROUND = 4000  # keyframes of a round so wide that one loop back to its start could be chance
 
 
-def two_loops(apart):
-    """Return a noise-free round and two loops behind it that say it ends `apart` m apart [x]."""
+def two_loops(apart, count=2):
+    """Return a noise-free round and two loops behind it, or one; two end `apart` m apart [x]."""
     n = ROUND + 100
     angle, radius = 2 * np.pi * np.arange(n) / ROUND, ROUND / (2 * np.pi)
     truth = np.column_stack((radius * np.sin(angle), radius * (1 - np.cos(angle)), angle))
     graph = graph_of(truth, chain_of(n), 0.0, np.diag(np.array([0.085, 0.085, 0.0085]) ** -2))
-    start = np.array([10, 31])
-    measure(graph, truth, start, start + ROUND, [[0.0, 0, 0], [apart, 0, 0]], SURE)
+    start = np.array([10, 31])[:count]
+    measure(graph, truth, start, start + ROUND, [[0.0, 0, 0], [apart, 0, 0]][:count], SURE)
     return graph
 
 
@@ -86,6 +86,21 @@ def test_where_few_are_believed_by_themselves_others_come_in_together(monkeypatc
     assert len(rows) == 3
     monkeypatch.setattr(gating, '_FEW', few)
     assert len(growth.believable(rows)) == believed
+
+
+def test_a_loop_that_is_true_by_itself_vouches_for_none_that_it_says_nothing_of(monkeypatch):
+    """A sure loop of twelve steps, and far from it one that alone is not to be believed."""
+    graph = two_loops(2.5, count=1)
+    for first in 2000, 2100:
+        measure(graph, np.zeros((ROUND + 100, 3)), [first], [first + 12],
+                se2.between(*odometry_poses(graph)[[first, first + 12], None])[0], SURE)
+    growth = Growth(graph)
+    growth.accepted[-1] = True
+    growth.solve()
+    rows = growth.undecided()
+    monkeypatch.setattr(gating, '_FEW', 1.0)
+    assert growth.given.is_loop[rows].all() and len(rows) == 2
+    assert len(growth.believable(rows)) == 1
 
 
 def test_lies_of_one_place_do_not_teach_their_noise():
