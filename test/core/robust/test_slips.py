@@ -96,6 +96,17 @@ def test_where_all_loops_along_a_lap_are_of_one_place_they_still_tell_of_slips(
     assert position_error(poses, world.truth) < 0.4
 
 
+@pytest.mark.parametrize('n, rounds, loops, lies, steps, turn', [
+    (358, 2, 150, 33, [49], 1.48), (441, 3, 170, 63, [110, 404], 1.48)])
+def test_a_run_of_loops_that_a_cut_lets_in_counts_though_their_place_was_known(
+        n, rounds, loops, lies, steps, turn):
+    """Of laps one place is accepted on either side of the slip, so a cut wins no other one."""
+    rng = np.random.default_rng(1)
+    world = spoilt(laps(n, rounds, loops, CAREFUL, rng), 'random', lies)
+    judgement, _ = robust_solve(graph := slipped(world.graph, steps, [0.0, 0.0, turn]))
+    assert graph.between.i[judgement.slips].tolist() == steps and not judgement.doubts
+
+
 @pytest.mark.parametrize('stated, turn, named', [(1.0, 0.14, [STEP]), (10.0, 0.14, []),
                                                  (10.0, 0.2, [STEP])])
 def test_what_is_within_the_noise_as_stated_is_no_slip(bad, stated, turn, named):
