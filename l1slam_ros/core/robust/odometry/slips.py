@@ -272,7 +272,11 @@ def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
 
 
 def _cut_rather(state: Growth, cut: int, motion: Motion) -> tuple[Growth, int, bool]:
-    """Return the state cut at the likeliest step between the same loops; that; whether usual."""
+    """
+    Return the state cut at the likeliest step between the same loops; that; whether usual.
+
+    That is, whether the robot, repaired, moves there as elsewhere.
+    """
     step = _likeliest(state, cut, motion)
     if step != cut:
         state = _cut_at(state, cut, step)
