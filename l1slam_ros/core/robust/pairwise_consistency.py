@@ -121,7 +121,8 @@ def gain_of(growth: Growth, as_stated: Growth, cut: Growth) -> float:
     A robot that goes the same way again and again sees one place all along: that is won before,
     however many of its loops are refused. So a run of these counts as a place does.
     """
-    is_loop, place = growth.given.is_loop, growth.given.place
+    is_loop = growth.given.is_loop
+    place = growth.given.place
     before, after = growth.accepted & is_loop, cut.accepted & is_loop
     more = np.flatnonzero(
         after & ~before & ~as_stated.accepted & np.isin(place, place[before]))

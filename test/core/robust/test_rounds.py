@@ -72,17 +72,21 @@ def test_two_loops_vouch_for_each_other_only_within_the_gate_of_both(apart, beli
     assert len(growth.believable(rows)) == believed
 
 
-@pytest.mark.parametrize(('few', 'believed'), [(0.3, 1), (0.4, 3)])
-def test_where_few_are_believed_by_themselves_others_come_in_together(monkeypatch, few, believed):
-    """One of three is sure; the other two vouch for each other, in this round or the next."""
-    graph = two_loops(2.5)
+def beside_a_sure_one(graph):
+    """Return the state of a round with two sure loops besides, and the undecided; one is in."""
     for first in 2000, 2100:
         measure(graph, np.zeros((ROUND + 100, 3)), [first], [first + 12],
                 se2.between(*odometry_poses(graph)[[first, first + 12], None])[0], SURE)
     growth = Growth(graph)
     growth.accepted[-1] = True
     growth.solve()
-    rows = growth.undecided()
+    return growth, growth.undecided()
+
+
+@pytest.mark.parametrize(('few', 'believed'), [(0.3, 1), (0.4, 3)])
+def test_where_few_are_believed_by_themselves_others_come_in_together(monkeypatch, few, believed):
+    """One of three is sure; the other two vouch for each other, in this round or the next."""
+    growth, rows = beside_a_sure_one(two_loops(2.5))
     assert len(rows) == 3
     monkeypatch.setattr(gating, '_FEW', few)
     assert len(growth.believable(rows)) == believed
@@ -90,14 +94,7 @@ def test_where_few_are_believed_by_themselves_others_come_in_together(monkeypatc
 
 def test_a_loop_that_is_true_by_itself_vouches_for_none_that_it_says_nothing_of(monkeypatch):
     """A sure loop of twelve steps, and far from it one that alone is not to be believed."""
-    graph = two_loops(2.5, count=1)
-    for first in 2000, 2100:
-        measure(graph, np.zeros((ROUND + 100, 3)), [first], [first + 12],
-                se2.between(*odometry_poses(graph)[[first, first + 12], None])[0], SURE)
-    growth = Growth(graph)
-    growth.accepted[-1] = True
-    growth.solve()
-    rows = growth.undecided()
+    growth, rows = beside_a_sure_one(two_loops(2.5, count=1))
     monkeypatch.setattr(gating, '_FEW', 1.0)
     assert growth.given.is_loop[rows].all() and len(rows) == 2
     assert len(growth.believable(rows)) == 1
