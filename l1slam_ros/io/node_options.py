@@ -21,6 +21,7 @@ from l1slam_ros.core.names import OF_ROS
 from l1slam_ros.core.options import Options, Scalar, dotted, option
 from l1slam_ros.core.running.backend import BackendOptions
 from l1slam_ros.io.bounded import read_yaml
+from l1slam_ros.io.files import reported
 
 # A robot's name, which topics begin with.
 _NAME = re.compile('[A-Za-z][A-Za-z0-9_]*')
@@ -102,9 +103,11 @@ def read_params_file(path: Path) -> NodeOptions:
     FileError : it cannot be read, is not a parameter file, or sets a value that is refused.
 
     """
+    with reported(path, 'read'):
+        written = path.read_bytes()
     try:
-        content = read_yaml(path.read_text())
-    except (OSError, ValueError, yaml.YAMLError) as error:
+        content = read_yaml(written.decode())
+    except (ValueError, yaml.YAMLError) as error:
         raise FileError(path, 'expected a YAML file: ' + ' '.join(str(error).split())) from error
     sections = list(_sections(content))
     named = any(name == _NODE for name, _ in sections)

@@ -674,6 +674,7 @@ def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_pa
     (['solve', 'graph.g2o', '--plot', 'out.doc'], '.png'),
     (['solve', 'graph.g2o', '--reference', 'missing.txt'], 'missing.txt'),
     (['solve', 'graph.g2o', '--params-file', 'graph.txt'], 'parameters'),
+    (['solve', 'graph.g2o', '--params-file', 'other'], 'other: cannot be read: Is a directory'),
     (['solve', 'graph.g2o', '--plot', 'taken.png'], 'taken.png: cannot be written: it is a di'),
     (['solve', 'missing.g2o', '--output', '/proc/out.g2o'], '/proc/out.g2o: cannot be written'),
     (['solve', 'missing.g2o', '--plot', '/proc/out.png'], '/proc/out.png: cannot be written'),
