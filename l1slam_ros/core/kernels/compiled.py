@@ -38,6 +38,8 @@ class Loop:
     """
     A function of arrays and numbers that is compiled.
 
+    It runs without the interpreter's lock, so that other threads go on, unless it is brief.
+
     Sums may be reordered (that is what lets them be vectorised); NaN and infinity keep their
     meaning. Where no folder can be written the result is not kept, and every process compiles.
 
