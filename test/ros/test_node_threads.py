@@ -44,10 +44,11 @@ def compiling(monkeypatch):
             pass
 
     monkeypatch.setattr(solver_thread, 'fill_cache', fill_cache)
+    monkeypatch.setattr(solver_thread, '_WORTH_TELLING', 0.0)
     return finish
 
 
-def test_while_the_solver_is_compiled_all_else_is_served(bench, compiling, tmp_path):
+def test_while_the_solver_is_compiled_all_else_is_served(bench, compiling, tmp_path, capfd):
     b = bench(save_path=str(tmp_path / 'map.g2o'))
     b.drive(0, 4)
     b.until(lambda: len(b.received['pose']) == 4, 'odometry is answered')
@@ -55,6 +56,7 @@ def test_while_the_solver_is_compiled_all_else_is_served(bench, compiling, tmp_p
     assert call(b, 'pause', SetBool.Request(data=False)).success
     assert call(b, 'reset').success and call(b, 'load').success
     b.until(lambda: b.status()[1] == 'compiling the solver: 1 of 2', 'it says how far it is')
+    assert 'compiling the solver, once on a machine: 1 of 2' in capfd.readouterr().err
     waiting = begin(b, 'optimize')
     b.drive(4, 6)
     b.until(lambda: b.status()[2]['odom.received'] == '6', 'odometry is taken in')

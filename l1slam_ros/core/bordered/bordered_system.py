@@ -165,10 +165,10 @@ class BorderedSystem:
 
         """
         pivot = np.linalg.cholesky(predicted.covariance + np.diag(noise))
-        lines = np.concatenate((predicted.rows, pivot), axis=1)
         # Row r ends at its diagonal.
-        k, columns = lines.shape
-        self._factor.extend(lines[np.tri(k, columns, columns - k, dtype=bool)])
+        for r, row in enumerate(predicted.rows):
+            self._factor.extend(row)
+            self._factor.extend(pivot[r, :r + 1])
         self._right.extend(-np.linalg.solve(pivot, predicted.residual))
         self._ends.extend(predicted.points[None])
         self._blocks.extend(predicted.blocks[None])

@@ -33,7 +33,7 @@ from l1slam_ros.core.bordered.points import FIXED
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
-from l1slam_ros.core.graph.growable_array import GrowingArray
+from l1slam_ros.core.graph.growable_array import GrowingArray, few_rows
 from l1slam_ros.core.graph.linear_system import anchor, linearise
 from l1slam_ros.core.robust.innovation import chi2_quantile, claimed_volume
 from l1slam_ros.core.robust.odometry.drift import corrected
@@ -188,7 +188,8 @@ class Front:
     def poses_of(self, keyframes: Indices) -> Array:
         """Return the L1 poses of some keyframes that it knows, (m, p)."""
         steps = self._systems[L1].step(np.maximum(keyframes - self._fixed, FIXED).tolist())
-        return self._manifold.retract(self._first.view()[keyframes, L1], steps)
+        first = few_rows(self._first.view(), keyframes)[:, L1]
+        return self._manifold.retract(first, steps)
 
     def covariance(self, keyframe: int, seen_from: int | None = None) -> Array:
         """
@@ -306,12 +307,12 @@ class Front:
         be seen in the order of their indices, so a factor that skips one is beyond.
         """
         manifold = self._manifold
-        pairs = np.stack((factors.i[rows], factors.j[rows]), axis=1)
+        pairs = np.stack((few_rows(factors.i, rows), few_rows(factors.j, rows)), axis=1)
         newest = np.maximum.accumulate(np.append(len(self._first) - 1, pairs.max(axis=1)))
         skips = np.flatnonzero(np.diff(newest) > 1)
         pairs = pairs[:skips[0] if len(skips) else None]
         rows = rows[:len(pairs)]
-        Z, root = factors.measurement[rows], factors.sqrt_information[rows]
+        Z, root = few_rows(factors.measurement, rows), few_rows(factors.sqrt_information, rows)
         if self._drift:
             odometry = factors.is_odometry[rows]
             Z[odometry] = corrected(factors, rows[odometry], self._drift)
@@ -342,7 +343,7 @@ class Front:
     def _moved(self, keyframes: Indices) -> tuple[Array, Array, Array]:
         """Return where keyframes began, their steps and where they are, (m, 2, p or k) each."""
         manifold = self._manifold
-        first = self._first.view()[keyframes]
+        first = few_rows(self._first.view(), keyframes)
         first[keyframes == WORLD] = manifold.identity(1)
         ends = np.maximum(keyframes - self._fixed, FIXED).tolist()
         steps = np.stack([system.step(ends) for system in self._systems], axis=1)

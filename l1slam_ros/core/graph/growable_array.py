@@ -80,3 +80,15 @@ def _reserved(shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
     if hasattr(mmap, 'MADV_NOHUGEPAGE'):
         memory.madvise(mmap.MADV_NOHUGEPAGE)
     return np.frombuffer(memory, dtype, count).reshape(shape)
+
+
+def few_rows(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """
+    Return a few rows of an array, (k, *shape), as `array[rows]` does.
+
+    That would let go of the interpreter's lock each time; see `brief` of `kernels.compiled.Loop`.
+    """
+    some = np.empty((len(rows), *array.shape[1:]), array.dtype)
+    for place, row in enumerate(rows.tolist()):
+        some[place] = array[row]
+    return some

@@ -211,7 +211,7 @@ def _dot_three(line, length, x, y, z):
     return of_x, of_y, of_z
 
 
-@loop('(f8[:, :, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, :, ::1])')
+@loop('(f8[:, :, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, :, ::1])', brief=True)
 def follow(covariance, parent, turn, noise, product):
     """Write the covariances of all points with a new one that hangs on `parent`, (t, k, k)."""
     last, k = len(product) - 1, len(turn)
@@ -247,7 +247,7 @@ def _multiply(left, right, product):
 
 
 @loop('(f8[:, :, ::1], f8[:, ::1], i8[:, ::1], f8[:, :, :, ::1], f8[::1], f8[::1], i8[::1], '
-      'f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1])')
+      'f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1])', brief=True)
 def predict(covariance, mean, ends, blocks, factor, right, own_ends, own_blocks, rows, said,
             expected):
     """
@@ -315,7 +315,7 @@ def _reduce(factor, rows):
             row[r] = total / line[r]
 
 
-@loop('(f8[::1], f8[::1], i8[:, ::1], f8[:, :, :, ::1], f8[:, ::1])')
+@loop('(f8[::1], f8[::1], i8[:, ::1], f8[:, :, :, ::1], f8[:, ::1])', brief=True)
 def pull(factor, right, ends, blocks, gradient):
     """Add to the gradient (t, k) what factors pull at points: A'lambda, F'lambda = right."""
     t, k = gradient.shape
@@ -335,7 +335,7 @@ def pull(factor, right, ends, blocks, gradient):
                         gradient[end, c] += blocks[b, side, r, c] * x[b * k + r]
 
 
-@loop('(f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1])')
+@loop('(f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1])', brief=True)
 def move(covariance, mean, gradient, points):
     """Return the steps of some points, (m, k), -1 for none, by what pulls at all of them."""
     t, k = gradient.shape

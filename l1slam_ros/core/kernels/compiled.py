@@ -36,7 +36,9 @@ ANY_SIZE = ('UniTuple(i8, 3)', 'f8[::1]')
 
 class Loop:
     """
-    A function of arrays and numbers that is compiled; it runs without the interpreter's lock.
+    A function of arrays and numbers that is compiled.
+
+    It runs without the interpreter's lock, so that other threads go on, unless it is brief.
 
     Sums may be reordered (that is what lets them be vectorised); NaN and infinity keep their
     meaning. Where no folder can be written the result is not kept, and every process compiles.
@@ -47,6 +49,8 @@ class Loop:
     takes : the types of its arguments in numba's words, so that it can be compiled without them;
     f8[:, ::1] is an array of doubles, rows one after the other. Several: one version for each
     takes_in_space : those of the versions that only graphs in space need
+    brief : it keeps the interpreter's lock. Whoever lets go of it, for however short a time, may
+        have to wait until a thread that has taken it meanwhile lets go of it in turn
 
     Attributes
     ----------
@@ -55,12 +59,13 @@ class Loop:
     """
 
     def __init__(self, py_func: Kernel, takes: tuple[str, ...] = (),
-                 takes_in_space: tuple[str, ...] = ()) -> None:
+                 takes_in_space: tuple[str, ...] = (), brief: bool = False) -> None:
         update_wrapper(self, py_func)
         objects.note_import(_source(py_func))
         self.py_func = py_func
         self.takes = takes
         self.takes_in_space = takes_in_space
+        self.brief = brief
         self.linked: tuple[link.Linked, ...] = ()
         self._sought: dict[bool, bool] = {}
         self._dispatcher: Any = None
@@ -113,7 +118,7 @@ class Loop:
         """The loop as numba has it, which is imported now at the latest."""
         with link.lock:
             if self._dispatcher is None:
-                self._dispatcher = _dispatcher(self.py_func)
+                self._dispatcher = _dispatcher(self.py_func, self.brief)
         return self._dispatcher
 
     @property
@@ -125,9 +130,10 @@ class Loop:
 compiled = Loop
 
 
-def loop(*takes: str, space: tuple[str, ...] = ()) -> Callable[[Kernel], Loop]:
+def loop(*takes: str, space: tuple[str, ...] = (), brief: bool = False) -> Callable[
+        [Kernel], Loop]:
     """Return what makes a function that the interpreter calls a `Loop`."""
-    return lambda function: Loop(function, takes, space)
+    return lambda function: Loop(function, takes, space, brief)
 
 
 def for_sizes(takes: str, plane: tuple[str, ...] = ('UniTuple(i8, 3)',)) -> Callable[
@@ -182,15 +188,16 @@ def _compile(dispatcher: Any, takes: str) -> Any:
     return dispatcher.overloads[types]
 
 
-def _dispatcher(function: Kernel) -> Any:
-    """Return a function as numba has it."""
+def _dispatcher(function: Kernel, brief: bool) -> Any:
+    """Return a function as numba has it; brief : see `Loop`."""
     import numba
 
     _spare_blas()
     own = function.__name__.startswith('_')
     # After an upgrade numba would keep what this process has under the source that is there now.
     as_imported = objects.is_as_imported(_source(function))
-    options = {'nogil': True, 'error_model': 'numpy', 'fastmath': {'contract', 'reassoc', 'nsz'},
+    options = {'nogil': not brief, 'error_model': 'numpy',
+               'fastmath': {'contract', 'reassoc', 'nsz'},
                'no_cfunc_wrapper': True, 'no_cpython_wrapper': own}
     try:
         return numba.njit(cache=as_imported and not own, **options)(function)

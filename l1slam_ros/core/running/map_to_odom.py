@@ -83,7 +83,8 @@ def _transforms(ends: list[tuple[RobotOdometry, Newest]]) -> Array:
     """Return the transforms of robots by the ends of their maps, (r, p)."""
     manifold = ends[0][0].manifold
     odometry = np.concatenate([
-        robot.track.poses_of(np.array([newest.keyframe])) for robot, newest in ends])
+        robot.track.poses_of(slice(newest.keyframe, newest.keyframe + 1))
+        for robot, newest in ends])
     to_kept = manifold.compose(np.concatenate([newest.pose for _, newest in ends]),
                                manifold.inverse(odometry))
     return manifold.compose(to_kept, np.concatenate([robot.offset for robot, _ in ends]))

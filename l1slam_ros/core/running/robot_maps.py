@@ -19,6 +19,7 @@ the map of the first robot is that of the world, and a robot that is not tied to
 the first one, has a map of its own.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -98,9 +99,10 @@ class Seen(NamedTuple):
 
     def pairs(self, accepted: Mask, known: int) -> Indices:
         """Return the robots that accepted factors of the first keyframes join, see `pairs_of`."""
+        if len(self.numbers) < 2:
+            return np.zeros((0, 2), np.int64)
         i, j = self.factors.i[:len(accepted)], self.factors.j[:len(accepted)]
-        rows = accepted & (i < known) & (j < known) if len(self.numbers) > 1 else accepted[:0]
-        return pairs_of(self.robot, self.factors, rows)
+        return pairs_of(self.robot, self.factors, accepted & (i < known) & (j < known))
 
     def maps(self, known: int, pairs: Indices,
              pose: Callable[[Indices], Array]) -> dict[int, RobotMap]:
@@ -160,7 +162,7 @@ def _ends(seen: Seen, known: int, pose: Callable[[Indices], Array],
     """Return them of the first keyframes; pairs : (k, 2) the robots that their factors join."""
     maps = seen.maps(known, pairs, pose)
     lasts = {robot: last for robot, numbers in seen.numbers.items()
-             if (last := int(np.searchsorted(numbers, known)) - 1) >= 0}
+             if (last := bisect_left(numbers, known) - 1) >= 0}
     if not lasts:
         return {}
     newest = pose(np.array([seen.numbers[robot][last] for robot, last in lasts.items()]))

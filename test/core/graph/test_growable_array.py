@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l1slam_ros.core.graph.growable_array import GrowingArray
+from l1slam_ros.core.graph.growable_array import GrowingArray, few_rows
 
 
 def rows(first, count):
@@ -51,3 +51,13 @@ def test_appending_moves_the_rows_only_now_and_then():
         address = array.view().__array_interface__['data'][0]
         moves, home = moves + (address != home), address
     assert moves < 12
+
+
+@pytest.mark.parametrize('wanted', [[0, 8, 3, 3], [-1], []])
+@pytest.mark.parametrize('array', [rows(0, 9), np.arange(9), np.arange(9) > 4],
+                         ids=['rows', 'numbers', 'mask'])
+def test_few_rows_are_those_that_numpy_finds(array, wanted):
+    wanted = np.array(wanted, np.int64)
+    found = few_rows(array, wanted)
+    np.testing.assert_array_equal(found, array[wanted])
+    assert found.dtype == array.dtype and not np.shares_memory(found, array)

@@ -124,6 +124,18 @@ def run(code, **settings):
     return done.stdout.split()
 
 
+def test_the_loops_that_are_brief_keep_the_interpreters_lock_and_no_others():
+    brief = set()
+    for step in with_space((*STEPS, *SCANS), se3):
+        for name, versions in objects.read(step).items():
+            for kept in versions:
+                lets_go = {'PyEval_SaveThread', 'PyEval_RestoreThread'} & set(kept.missing)
+                assert len(lets_go) in (0, 2)
+                if not lets_go:
+                    brief.add((step, name))
+    assert brief == {('border', name) for name in ('follow', 'predict', 'pull', 'move')}
+
+
 def test_every_loop_gives_the_same_by_both_ways():
     work = WORK[:WORK.index('assert fill_cache')]
     rest = WORK[WORK.index('world = spoilt'):WORK.index('for missing in compiled_here')]

@@ -21,7 +21,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import LEAST_VARIANCE, Mask
-from l1slam_ros.core.graph.growable_array import GrowingArray
+from l1slam_ros.core.graph.growable_array import GrowingArray, few_rows
 from l1slam_ros.core.graph.measurements import LONGEST_PAUSE
 from l1slam_ros.core.online.odometry.plausibility import UNSEEN, is_identity
 from l1slam_ros.core.online.odometry.silences import Silences
@@ -109,7 +109,9 @@ class OdometryTrack:
 
     def poses_of(self, keyframes: Indices | slice) -> Array:
         """Return the poses of some keyframes, (m, p)."""
-        return self._poses.view()[self._keyframes.view()[keyframes]]
+        rows, poses = self._keyframes.view()[keyframes], self._poses.view()
+        # Each update asks for the first one and for the last.
+        return few_rows(poses, rows) if len(rows) == 1 else poses[rows]
 
     @property
     def gaps(self) -> Indices:

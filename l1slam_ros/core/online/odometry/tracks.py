@@ -80,8 +80,9 @@ class Tracks:
 
     def of_each(self, robots: Indices) -> 'Ends':
         """Return what is asked of the tracks of some robots, (m,), one for each end of loops."""
-        return Ends([(self._tracks[robot], np.flatnonzero(robots == robot))
-                     for robot in sorted(set(robots.tolist()))], len(robots))
+        named = sorted(set(robots.tolist()))
+        return Ends([(self._tracks[robot], np.flatnonzero(robots == robot)
+                      if len(named) > 1 else slice(None)) for robot in named], len(robots))
 
 
 class Ends:
@@ -95,7 +96,7 @@ class Ends:
 
     """
 
-    def __init__(self, groups: list[tuple[OdometryTrack, Indices]], count: int):
+    def __init__(self, groups: list[tuple[OdometryTrack, Indices | slice]], count: int):
         self._groups, self._count = groups, count
 
     def first(self) -> Indices:
@@ -125,7 +126,8 @@ class Ends:
         return self._of_all(lambda track, at: track.poses_of(
             np.searchsorted(track.numbers.view(), keyframes[at])))
 
-    def _of_all(self, of: Callable[[OdometryTrack, Indices], Any], kind: type = float) -> Any:
+    def _of_all(self, of: Callable[[OdometryTrack, Indices | slice], Any],
+                kind: type = float) -> Any:
         """Return what tracks say, one after the other, each of its rows."""
         said: Any = None
         for track, rows in self._groups:
