@@ -268,7 +268,7 @@ def block_addresses(keyframe, position, first, start, pattern, offset, stride, k
     Returns
     -------
     address, width, turned : of the block between the keyframes of each factor, (m,) each, see
-        `cholesky.assemble`
+        `blocks.assemble`
     corner, own : where each keyframe's own block begins and its panel's stride, (n,)
 
     """
