@@ -57,7 +57,8 @@ def _solve_tile(vectors, panels, place, rows, column, columns, corner):
     """
     Solve for up to six rows and the columns of a factored corner.
 
-    corner : (lanes + 1, lanes) the columns of the corner below its diagonal, and 1 over that
+    corner : (lanes + 1, lanes) each column of the corner below its diagonal over the entry there,
+    and one over all these entries
     """
     row = vectors.indices(_ROWS, rows)
     mask = vectors.first(columns)
@@ -65,13 +66,24 @@ def _solve_tile(vectors, panels, place, rows, column, columns, corner):
     found = [vectors.load(where, mask) for where in to]
     for k in range(vectors.lanes):
         below = vectors.load(vectors.at(corner, vectors.lanes * k))
-        inverse = vectors.entry(corner, vectors.lanes**2 + k)
-        found = [vectors.eliminated(one, k, inverse, below) for one in found]
+        found = [vectors.eliminated(one, k, below) for one in found]
+    inverse = vectors.load(vectors.at(corner, vectors.lanes**2))
     for where, one in zip(to, found, strict=True):
-        vectors.store(one, where, mask)
+        vectors.store(vectors.scaled(one, inverse), where, mask)
+
+
+def _pack_tile(vectors, source, stride, rows, inner, packed):
+    """Write up to as many rows as a vector has numbers as columns, (inner, lanes)."""
+    begin = [vectors.at(source, vectors.times(r, stride))
+             for r in vectors.indices(vectors.lanes, rows)]
+    with vectors.range(inner) as q:
+        numbers = [vectors.entry(one, q) for one in begin]
+        vectors.store(vectors.gathered(numbers),
+                      vectors.at(packed, vectors.times(q, vectors.lanes)))
 
 
 _subtract_wide, _subtract_narrow = (Inline(_subtract_tile, lanes) for lanes in (_WIDE, _NARROW))
+_pack_wide, _pack_narrow = (Inline(_pack_tile, lanes) for lanes in (_WIDE, _NARROW))
 _solve_wide, _solve_narrow = (Inline(_solve_tile, lanes) for lanes in (_WIDE, _NARROW))
 
 
@@ -180,13 +192,14 @@ def _subtract(source, stride, inner, height, columns, panels, place, target, pac
         end = c + 1
         while end < min(c + _WIDE, columns) and target[end] == target[end - 1] + 1:
             end += 1
-        lanes = _WIDE if end - c > _NARROW else _NARROW
-        for j in range(c, end):
-            for q in range(inner):
-                packed[q * lanes + j - c] = source[j * stride + q]
+        is_wide = end - c > _NARROW
+        if is_wide:
+            _pack_wide(source[c * stride:], stride, end - c, inner, packed)
+        else:
+            _pack_narrow(source[c * stride:], stride, end - c, inner, packed)
         for r in range(c, height, _ROWS):
             left, rows, to = source[r * stride:], min(_ROWS, height - r), place[r:]
-            if lanes == _WIDE:
+            if is_wide:
                 _subtract_wide(left, stride, rows, packed, inner, panels, to, target[c], end - c)
             else:
                 _subtract_narrow(left, stride, rows, packed, inner, panels, to, target[c],
@@ -226,20 +239,21 @@ def _factorise_corner(corner, stride, width, least, lanes, packed):
     """Factor a diagonal block of a few columns, and pack it for `_solve_tile`; as above."""
     for k in range(lanes * (lanes + 1)):
         packed[k] = 0.0
+    inverse = packed[lanes * lanes:]
     for k in range(width):
         pivot = corner[k * (stride + 1)]
         for q in range(k):
-            pivot -= packed[q * lanes + k] ** 2
+            pivot -= corner[k * stride + q] ** 2
         if not pivot > max(least[k], 0.0):
             return k
         root = np.sqrt(pivot)
-        inverse = 1 / root
+        inverse[k] = 1 / root
         corner[k * (stride + 1)] = root
-        packed[lanes * lanes + k] = inverse
         for r in range(k + 1, width):
             value = corner[r * stride + k]
             for q in range(k):
-                value -= packed[q * lanes + r] * packed[q * lanes + k]
-            corner[r * stride + k] = value * inverse
-            packed[k * lanes + r] = value * inverse
+                value -= corner[r * stride + q] * corner[k * stride + q]
+            value *= inverse[k]
+            corner[r * stride + k] = value
+            packed[k * lanes + r] = value * inverse[k]
     return width

@@ -229,10 +229,13 @@ class Vectors:
             return self._builder.load(address, align=_DOUBLE)
         return self._masked('load', self._type, [address], mask, [self.zeros])
 
-    def store(self, value: Any, address: Any, mask: Any) -> None:
+    def store(self, value: Any, address: Any, mask: Any = None) -> None:
         """Write those lanes of a vector that are not masked out."""
         address = self._builder.bitcast(address, self._type.as_pointer())
-        self._masked('store', self._ir.VoidType(), [value, address], mask, [])
+        if mask is None:
+            self._builder.store(value, address, align=_DOUBLE)
+        else:
+            self._masked('store', self._ir.VoidType(), [value, address], mask, [])
 
     def _masked(self, what: str, result: Any, before: list[Any], mask: Any,
                 after: list[Any]) -> Any:
@@ -253,14 +256,23 @@ class Vectors:
         """Return a vector without what a variable has."""
         return self._builder.fsub(value, self._builder.load(total))
 
-    def eliminated(self, row: Any, k: int, inverse: Any, below: Any) -> Any:
-        """Return a row with x = inverse times its entry k there, and without x below."""
-        builder, index = self._builder, self._ir.IntType(32)
-        x = self.spread(builder.fmul(builder.extract_element(row, index(k)), inverse))
-        rest = builder.fsub(row, builder.fmul(x, below, flags=('contract',)), flags=('contract',))
-        only = self._ir.VectorType(self._ir.IntType(1), self.lanes)(
-            [lane == k for lane in range(self.lanes)])
-        return builder.select(only, x, rest)
+    def eliminated(self, row: Any, k: int, below: Any) -> Any:
+        """Return a row less its entry k times a vector."""
+        index = self._ir.VectorType(self._ir.IntType(32), self.lanes)([k] * self.lanes)
+        entry = self._builder.shuffle_vector(row, row, index)
+        product = self._builder.fmul(entry, below, flags=('contract',))
+        return self._builder.fsub(row, product, flags=('contract',))
+
+    def scaled(self, row: Any, factor: Any) -> Any:
+        """Return the product of two vectors."""
+        return self._builder.fmul(row, factor)
+
+    def gathered(self, entries: list[Any]) -> Any:
+        """Return a vector of doubles, one for each lane."""
+        vector = self.zeros
+        for k, entry in enumerate(entries):
+            vector = self._builder.insert_element(vector, entry, self._ir.IntType(32)(k))
+        return vector
 
 
 def loop(*takes: str, space: tuple[str, ...] = ()) -> Callable[[Kernel], Loop]:
