@@ -173,7 +173,6 @@ class Vectors:
         self._number = ir.IntType(64)
         self._type = ir.VectorType(ir.DoubleType(), lanes)
         self.zeros = self._type([0.0] * lanes)
-        self.zero = ir.DoubleType()(0.0)
 
     def _as_number(self, number: Any) -> Any:
         return self._number(number) if isinstance(number, int) else number
@@ -188,20 +187,6 @@ class Vectors:
         """Return the product of two numbers."""
         return self._builder.mul(number, self._as_number(other))
 
-    def plus(self, number: Any, other: int) -> Any:
-        """Return a number and another one."""
-        return self._builder.add(number, self._number(other))
-
-    def at_most(self, number: int, below: Any) -> Any:
-        """Return a number, 0 unless it is below another one."""
-        is_below = self._builder.icmp_signed('<', self._number(number), below)
-        return self._builder.select(is_below, self._number(number), self._number(0))
-
-    def divided(self, number: Any, by: int) -> tuple[Any, Any]:
-        """Return the quotient and the remainder."""
-        quotient = self._builder.udiv(number, self._number(by))
-        return quotient, self._builder.sub(number, self.times(quotient, by))
-
     def at(self, address: Any, index: Any) -> Any:
         """Return the address of an entry."""
         return self._builder.gep(address, [self._as_number(index)])
@@ -215,10 +200,6 @@ class Vectors:
         from numba.core import cgutils
 
         return cgutils.alloca_once_value(self._builder, value)
-
-    def value(self, variable: Any) -> Any:
-        """Return what a variable has by now."""
-        return self._builder.load(variable)
 
     @contextmanager
     def range(self, count: Any) -> Iterator[Any]:
@@ -277,49 +258,14 @@ class Vectors:
 
     def eliminated(self, row: Any, k: int, below: Any) -> Any:
         """Return a row less its entry k times a vector."""
-        product = self._builder.fmul(self.lane(row, k), below, flags=('contract',))
+        index = self._ir.VectorType(self._ir.IntType(32), self.lanes)([k] * self.lanes)
+        entry = self._builder.shuffle_vector(row, row, index)
+        product = self._builder.fmul(entry, below, flags=('contract',))
         return self._builder.fsub(row, product, flags=('contract',))
 
     def scaled(self, row: Any, factor: Any) -> Any:
         """Return the product of two vectors."""
         return self._builder.fmul(row, factor)
-
-    def inverse(self, vector: Any) -> Any:
-        """Return one over each entry."""
-        return self._builder.fdiv(self._type([1.0] * self.lanes), vector)
-
-    def lane(self, vector: Any, k: int) -> Any:
-        """Return a vector of one entry of another."""
-        index = self._ir.VectorType(self._ir.IntType(32), self.lanes)([k] * self.lanes)
-        return self._builder.shuffle_vector(vector, vector, index)
-
-    def sums(self, vectors: list[Any]) -> Any:
-        """Return the sums of as many vectors as each has lanes."""
-        step = 1
-        while len(vectors) > 1:
-            vectors = [self._sums_of_pair(*pair, step)
-                       for pair in zip(vectors[::2], vectors[1::2], strict=True)]
-            step *= 2
-        return vectors[0]
-
-    def _sums_of_pair(self, left: Any, right: Any, step: int) -> Any:
-        """Return left plus itself, `step` lanes over, and in every other `step` lanes right."""
-        index = self._ir.VectorType(self._ir.IntType(32), self.lanes)
-        of = [self.lanes * (lane // step % 2) for lane in range(self.lanes)]
-        own, other = ([start + (lane ^ over) for lane, start in enumerate(of)]
-                      for over in (0, step))
-        return self._builder.fadd(self._builder.shuffle_vector(left, right, index(own)),
-                                  self._builder.shuffle_vector(left, right, index(other)))
-
-    def subtract_from(self, address: Any, places: list[Any], values: Any) -> None:
-        """Subtract a vector from entries, each of which may be named more than once."""
-        to = [self.at(address, place) for place in places]
-        index = self._ir.IntType(32)
-        less = [self._builder.fsub(self._builder.load(one),
-                                   self._builder.extract_element(values, index(k)))
-                for k, one in enumerate(to)]
-        for one, value in zip(to, less, strict=True):
-            self._builder.store(value, one)
 
     def gathered(self, entries: list[Any]) -> Any:
         """Return a vector of doubles, one for each lane."""

@@ -11,89 +11,12 @@ Solving with the factor that `cholesky` left in the panels, forwards and backwar
 
 So with what hangs on points of a border, each on one before it; see `border`.
 
-As `cholesky` does, it works on tiles whose sums stay in registers.
+Rows of a panel are taken three at a time, so that what is read of the solution serves all three.
 """
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import Inline, compiled, loop
-
-# Numbers of a vector, and of a narrow one.
-_WIDE, _NARROW = 8, 4
-
-
-def _subtract_tile(vectors, left, stride, rows, inner, own, x, place):
-    """Subtract from up to as many entries of x as a vector has products of rows with `own`."""
-    row = vectors.indices(vectors.lanes, rows)
-    begin = [vectors.at(left, vectors.times(r, stride)) for r in row]
-    totals = [vectors.variable(vectors.zeros) for _ in row]
-    whole, rest = vectors.divided(inner, vectors.lanes)
-    with vectors.range(whole) as q:
-        at = vectors.times(q, vectors.lanes)
-        factor = vectors.load(vectors.at(own, at))
-        for total, numbers in zip(totals, begin, strict=True):
-            vectors.add(total, vectors.load(vectors.at(numbers, at)), factor)
-    at, mask = vectors.times(whole, vectors.lanes), vectors.first(rest)
-    factor = vectors.load(vectors.at(own, at), mask)
-    for total, numbers in zip(totals, begin, strict=True):
-        vectors.add(total, vectors.load(vectors.at(numbers, at), mask), factor)
-    products = vectors.sums([vectors.value(total) for total in totals])
-    vectors.subtract_from(x, [vectors.entry(place, r) for r in row], products)
-
-
-def _pull_tile(vectors, below, stride, rows, known, own, columns):
-    """Subtract from up to as many entries of `own` as a vector has what the rows below pull."""
-    mask = vectors.first(columns)
-    totals = [vectors.variable(vectors.zeros) for _ in range(2)]
-    pairs, single = vectors.divided(rows, 2)
-    with vectors.range(pairs) as pair:
-        for k, total in enumerate(totals):
-            r = vectors.plus(vectors.times(pair, 2), k)
-            numbers = vectors.load(vectors.at(below, vectors.times(r, stride)), mask)
-            vectors.add(total, numbers, vectors.spread(vectors.entry(known, r)))
-    with vectors.range(single):
-        r = vectors.times(pairs, 2)
-        numbers = vectors.load(vectors.at(below, vectors.times(r, stride)), mask)
-        vectors.add(totals[0], numbers, vectors.spread(vectors.entry(known, r)))
-    left = vectors.load(own, mask)
-    for total in totals:
-        left = vectors.less(left, total)
-    vectors.store(left, own, mask)
-
-
-def _corner_tile(vectors, corner, stride, columns, own):
-    """Solve for as many entries of `own` as a vector has, with a corner of the factor."""
-    row = vectors.indices(vectors.lanes, columns)
-    begin = [vectors.at(corner, vectors.times(r, stride)) for r in row]
-    inverse = vectors.inverse(vectors.gathered(
-        [vectors.entry(one, r) for one, r in zip(begin, row, strict=True)]))
-    mask = vectors.first(columns)
-    found = vectors.load(own, mask)
-    for k in range(vectors.lanes - 1):
-        below = [vectors.entry(one, row[k]) for one in begin[k + 1:]]
-        column = vectors.gathered([vectors.zero] * (k + 1) + below)
-        found = vectors.eliminated(found, k, vectors.scaled(column, vectors.lane(inverse, k)))
-    vectors.store(vectors.scaled(found, inverse), own, mask)
-
-
-def _turned_tile(vectors, corner, stride, columns, own):
-    """Solve for as many entries of `own` as a vector has, with the transpose of a corner."""
-    row = vectors.indices(vectors.lanes, columns)
-    begin = [vectors.at(corner, vectors.times(r, stride)) for r in row]
-    inverse = vectors.inverse(vectors.gathered(
-        [vectors.entry(one, r) for one, r in zip(begin, row, strict=True)]))
-    mask = vectors.first(columns)
-    found = vectors.load(own, mask)
-    for k in range(vectors.lanes - 1, 0, -1):
-        before = vectors.load(begin[k], vectors.first(vectors.at_most(k, columns)))
-        found = vectors.eliminated(found, k, vectors.scaled(before, vectors.lane(inverse, k)))
-    vectors.store(vectors.scaled(found, inverse), own, mask)
-
-
-_subtract_wide, _subtract_narrow = (Inline(_subtract_tile, lanes) for lanes in (_WIDE, _NARROW))
-_pull_wide, _pull_narrow = (Inline(_pull_tile, lanes) for lanes in (_WIDE, _NARROW))
-_corner_wide, _corner_narrow = (Inline(_corner_tile, lanes) for lanes in (_WIDE, _NARROW))
-_turned_wide, _turned_narrow = (Inline(_turned_tile, lanes) for lanes in (_WIDE, _NARROW))
+from l1slam_ros.core.kernels.compiled import compiled, loop
 
 
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i4[::1], f8[:, ::1])')
@@ -107,7 +30,7 @@ def solve(panels, first, start, pattern, offset, stride, position, right):
     tallest = 0
     for s in range(len(first) - 1):
         tallest = max(tallest, start[s + 1] - start[s])
-    place, known = np.empty(tallest * k, np.int64), np.empty(tallest * k)
+    place = np.empty(tallest * k, np.int64)
     for s in range(len(first) - 1):
         height = _write_places(pattern[start[s]:start[s + 1]], k, place)
         own = x[first[s] * k:first[s + 1] * k]
@@ -115,7 +38,7 @@ def solve(panels, first, start, pattern, offset, stride, position, right):
     for s in range(len(first) - 2, -1, -1):
         height = _write_places(pattern[start[s]:start[s + 1]], k, place)
         own = x[first[s] * k:first[s + 1] * k]
-        _backward(panels[offset[s]:offset[s + 1]], stride[s], place[:height], own, x, known)
+        _backward(panels[offset[s]:offset[s + 1]], stride[s], place[:height], own, x)
     solution = np.empty((n, k))
     for f in range(n):
         for a in range(k):
@@ -136,48 +59,44 @@ def _write_places(rows, k, place):
 def _forward(panel, stride, place, own, x):
     """Solve for the supernode's own rows, and subtract what they do to the rows below."""
     width, height = len(own), len(place)
-    for c in range(0, width, _WIDE):
-        columns, corner = min(_WIDE, width - c), panel[c * (stride + 1):]
-        if columns > _NARROW:
-            _subtract_wide(panel[c * stride:], stride, columns, c, own, x, place[c:])
-            _corner_wide(corner, stride, columns, own[c:])
-        else:
-            _subtract_narrow(panel[c * stride:], stride, columns, c, own, x, place[c:])
-            _corner_narrow(corner, stride, columns, own[c:])
-    if width > _NARROW:
-        for r in range(width, height, _WIDE):
-            rows = min(_WIDE, height - r)
-            _subtract_wide(panel[r * stride:], stride, rows, width, own, x, place[r:])
-    else:
-        for r in range(width, height, _NARROW):
-            rows = min(_NARROW, height - r)
-            _subtract_narrow(panel[r * stride:], stride, rows, width, own, x, place[r:])
+    for r in range(width):
+        row, total = panel[r * stride:r * stride + width], 0.0
+        for c in range(r):
+            total += row[c] * own[c]
+        own[r] = (own[r] - total) / row[r]
+    for r in range(width, height, 3):
+        r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
+        row0, row1 = panel[r * stride:r * stride + width], panel[r1 * stride:r1 * stride + width]
+        row2 = panel[r2 * stride:r2 * stride + width]
+        s0 = s1 = s2 = 0.0
+        for c in range(width):
+            s0 += row0[c] * own[c]
+            s1 += row1[c] * own[c]
+            s2 += row2[c] * own[c]
+        x[place[r]] -= s0
+        if r1 > r:
+            x[place[r1]] -= s1
+        if r2 > r1:
+            x[place[r2]] -= s2
 
 
 @compiled
-def _backward(panel, stride, place, own, x, known):
-    """
-    Solve with the transpose for the supernode's own rows, once all below are known.
-
-    known : work space for what is below
-    """
+def _backward(panel, stride, place, own, x):
+    """Solve with the transpose for the supernode's own rows, once all below are known."""
     width, height = len(own), len(place)
-    for r in range(width, height):
-        known[r - width] = x[place[r]]
-    for c in range(0, width, _WIDE):
-        below, columns = panel[width * stride + c:], min(_WIDE, width - c)
-        if columns > _NARROW:
-            _pull_wide(below, stride, height - width, known, own[c:], columns)
-        else:
-            _pull_narrow(below, stride, height - width, known, own[c:], columns)
-    for c in range((width - 1) // _WIDE * _WIDE, -1, -_WIDE):
-        columns, corner = min(_WIDE, width - c), panel[c * (stride + 1):]
-        if columns > _NARROW:
-            _turned_wide(corner, stride, columns, own[c:])
-        else:
-            _turned_narrow(corner, stride, columns, own[c:])
-        for left in range(0, c, _WIDE):
-            _pull_wide(panel[c * stride + left:], stride, columns, own[c:], own[left:], _WIDE)
+    for r in range(width, height, 3):
+        r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
+        row0, row1 = panel[r * stride:r * stride + width], panel[r1 * stride:r1 * stride + width]
+        row2 = panel[r2 * stride:r2 * stride + width]
+        x0, x1, x2 = x[place[r]], x[place[r1]], x[place[r2]]
+        x1, x2 = x1 if r1 > r else 0.0, x2 if r2 > r1 else 0.0
+        for c in range(width):
+            own[c] -= row0[c] * x0 + row1[c] * x1 + row2[c] * x2
+    for r in range(width - 1, -1, -1):
+        row = panel[r * stride:r * stride + width]
+        own[r] /= row[r]
+        for c in range(r):
+            own[c] -= row[c] * own[r]
 
 
 @loop('(i8[::1], f8[:, :, ::1], f8[:, ::1])')
