@@ -15,9 +15,12 @@ Sums over factors of products of their two blocks with vectors.
 import numpy as np
 
 from l1slam_ros.core.kernels.compiled import ANY_SIZE, compiled, for_sizes
+from l1slam_ros.core.kernels.vectors.inline import Inline
 
 _FACTORS = ('f8[::1], i8[:, ::1], i8[::1], i8[::1], b1[::1], i8[::1], i8[::1], f8[:, :, :, ::1], '
             'f8[:, ::1], f8[:, ::1], f8[:, :, :, ::1], f8')
+# Rows of a block of whole poses in space.
+_IN_SPACE = 6
 # Factors whose blocks are fetched at the same time.
 _AHEAD = 16
 
@@ -124,25 +127,17 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
     for f in range(len(blocks)):
         if f % _AHEAD == 0:
             seen += _read_ahead(panels, address[f:f + _AHEAD], width[f:f + _AHEAD], k)
-        for side in range(2):
-            for r in range(k):
-                for c in range(k):
-                    scaled[side, r, c] = weights[f, r] * blocks[f, side, r, c]
-            for r in range(k):
-                for c in range(r + 1):
-                    total = 0.0
-                    for a in range(k):
-                        total += blocks[f, side, a, r] * scaled[side, a, c]
-                    own[keyframe[f, side], r, c] += total
         left = 0 if turned[f] else 1
-        right = 1 - left
-        if address[f] >= 0:
-            for r in range(k):
-                for c in range(k):
-                    total = 0.0
-                    for a in range(k):
-                        total += blocks[f, left, a, r] * scaled[right, a, c]
-                    panels[address[f] + r * width[f] + c] += total
+        if k == _IN_SPACE:
+            for side in range(2):
+                _add_products(blocks, 2 * f + side, 2 * f + side, weights, f, own,
+                              keyframe[f, side] * k * k, k)
+            if address[f] >= 0:
+                _add_products(blocks, 2 * f + left, 2 * f + 1 - left, weights, f, panels,
+                              address[f], width[f])
+        else:
+            _add_small_products(blocks, weights, f, keyframe[f, 0], keyframe[f, 1], own, left,
+                                address[f], width[f], panels, scaled, size)
         if f < len(curvature):
             _add_curvature(own, panels, keyframe[f], address[f], width[f], left, curvature[f],
                            share, k)
@@ -151,6 +146,58 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
             for c in range(r + 1):
                 panels[corner[v] + r * stride[v] + c] = own[v, r, c]
     return seen
+
+
+@compiled
+def _add_small_products(blocks, weights, f, i, j, own, left, at, width, panels, scaled, size):
+    """
+    Add the products of a factor's blocks to what it joins, keyframes i and j; see `assemble`.
+
+    left : whose block has the rows of the one between; scaled : (2, k, k) work space
+    """
+    k = len(size)
+    right = 1 - left
+    for side in range(2):
+        v = i if side == 0 else j
+        for r in range(k):
+            for c in range(k):
+                scaled[side, r, c] = weights[f, r] * blocks[f, side, r, c]
+        for r in range(k):
+            for c in range(r + 1):
+                total = 0.0
+                for a in range(k):
+                    total += blocks[f, side, a, r] * scaled[side, a, c]
+                own[v, r, c] += total
+    if at >= 0:
+        for r in range(k):
+            for c in range(k):
+                total = 0.0
+                for a in range(k):
+                    total += blocks[f, left, a, r] * scaled[right, a, c]
+                panels[at + r * width + c] += total
+
+
+def _products_tile(vectors, blocks, one, other, weights, f, to, begin, stride):
+    """
+    Add the product of two blocks of a factor in space to rows of what is there.
+
+    one, other : numbers of the blocks; f : of the factor; begin, stride : of the rows
+    """
+    k = _IN_SPACE
+    mask = vectors.first(k)
+    left, right = (vectors.at(blocks, vectors.times(block, k * k)) for block in (one, other))
+    weights = vectors.at(weights, vectors.times(f, k))
+    scaled = [vectors.scaled(vectors.load(vectors.at(right, k * a), mask),
+                             vectors.spread(vectors.entry(weights, a))) for a in range(k)]
+    for r in range(k):
+        total = vectors.variable(vectors.zeros)
+        for a in range(k):
+            vectors.add(total, vectors.spread(vectors.entry(left, k * a + r)), scaled[a])
+        row = vectors.at(vectors.at(to, begin), vectors.times(stride, r))
+        vectors.store(vectors.sum(vectors.load(row, mask), vectors.value(total)), row, mask)
+
+
+_add_products = Inline(_products_tile, 8)
 
 
 @compiled

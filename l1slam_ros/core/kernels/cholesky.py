@@ -21,7 +21,8 @@ Source: Ng and Peyton, "Block sparse Cholesky algorithms on advanced uniprocesso
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import Inline, compiled, loop
+from l1slam_ros.core.kernels.compiled import compiled, loop
+from l1slam_ros.core.kernels.vectors.inline import Inline
 
 # A pivot that is left with less than this part of its diagonal entry is rounding.
 _SINGULAR = 1e-13
@@ -121,12 +122,7 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
             inner = (first[source + 1] - first[source]) * d
             top = offset[source] + reach[source] * d * stride[source]
             columns = _within(rows, first[s + 1])
-            # Row by row of the blocks: a loop over so few rows takes longer than what it does.
-            for a in range(d):
-                for k in range(len(rows)):
-                    place[k * d + a] = local[rows[k]] + a * stride[s]
-                for k in range(columns):
-                    target[k * d + a] = (rows[k] - first[s]) * d + a
+            _find_places(rows, columns, local, first[s], stride[s], d, place, target)
             _subtract(panels[top:], stride[source], inner, len(rows) * d, columns * d, panels,
                       place, target, packed)
             reach[source] += columns
@@ -142,6 +138,22 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
         reach[s] = first[s + 1] - first[s]
         _enqueue(s, reach, start, pattern, owner, share, mine, lists)
     return n
+
+
+@compiled
+def _find_places(rows, columns, local, first, stride, d, place, target):
+    """
+    Write where a source's rows begin in another one's panel, and which of its columns are which.
+
+    rows : (blocks,) positions, the first `columns` of them the panel's own; local : of each
+    position where it begins; place, target : see `_subtract`
+    """
+    # Row by row of the blocks: a loop over so few rows takes longer than what it does.
+    for a in range(d):
+        for k in range(len(rows)):
+            place[k * d + a] = local[rows[k]] + a * stride
+        for k in range(columns):
+            target[k * d + a] = (rows[k] - first) * d + a
 
 
 @compiled

@@ -18,11 +18,10 @@ that follow each other are written as one loop.
 A loop may call only functions of its own module: neither cache notices changes in other modules.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from functools import cached_property, update_wrapper
+from collections.abc import Callable
+from contextlib import suppress
+from functools import update_wrapper
 from importlib import import_module
-from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,6 @@ from l1slam_ros.core.kernels.kept import link, objects
 Kernel = Callable[..., Any]
 # Of blocks of whole poses in the plane, and of parts of poses; see `cholesky`.
 ANY_SIZE = ('UniTuple(i8, 3)', 'f8[::1]')
-_DOUBLE = 8  # [bytes]
 
 
 class Loop:
@@ -125,154 +123,6 @@ class Loop:
 
 
 compiled = Loop
-
-
-class Inline:
-    """
-    A part of loops that is written in LLVM's own instructions, on vectors of `lanes` doubles.
-
-    Parameters
-    ----------
-    write : gets `Vectors` and what a loop gives: of an array the address, else a number
-
-    """
-
-    def __init__(self, write: Kernel, lanes: int) -> None:
-        self._write, self._lanes = write, lanes
-
-    @cached_property
-    def _numba_type_(self) -> Any:
-        """What numba takes it for where a loop calls it."""
-        from numba import types
-        from numba.core.typing.templates import make_intrinsic_template
-
-        def typed(context: Any, *takes: Any) -> Any:
-            return types.void(*takes), self._written
-
-        typed.__signature__ = signature(self._write)  # type: ignore[attr-defined]
-        return types.Function(make_intrinsic_template(self, typed, self._write.__name__))
-
-    def _written(self, context: Any, builder: Any, call: Any, arguments: Any) -> Any:
-        from numba.core import types
-
-        given = [context.make_array(of)(context, builder, one).data
-                 if isinstance(of, types.Array) else one
-                 for of, one in zip(call.args, arguments, strict=True)]
-        self._write(Vectors(builder, self._lanes), *given)
-        return context.get_dummy_value()
-
-
-class Vectors:
-    """Writes instructions on vectors of `lanes` doubles; numbers are i64 or int, in and out."""
-
-    def __init__(self, builder: Any, lanes: int) -> None:
-        from llvmlite import ir
-
-        self.lanes = lanes
-        self._ir, self._builder = ir, builder
-        self._number = ir.IntType(64)
-        self._type = ir.VectorType(ir.DoubleType(), lanes)
-        self.zeros = self._type([0.0] * lanes)
-
-    def _as_number(self, number: Any) -> Any:
-        return self._number(number) if isinstance(number, int) else number
-
-    def indices(self, count: int, rows: Any) -> list[Any]:
-        """Return 0, 1, 2, ..., the last of the rows again where there are no more."""
-        last = self._builder.sub(rows, self._number(1))
-        return [self._builder.select(self._builder.icmp_signed('<', self._number(k), last),
-                                     self._number(k), last) for k in range(count)]
-
-    def times(self, number: Any, other: Any) -> Any:
-        """Return the product of two numbers."""
-        return self._builder.mul(number, self._as_number(other))
-
-    def at(self, address: Any, index: Any) -> Any:
-        """Return the address of an entry."""
-        return self._builder.gep(address, [self._as_number(index)])
-
-    def entry(self, address: Any, index: Any) -> Any:
-        """Return an entry."""
-        return self._builder.load(self.at(address, index))
-
-    def variable(self, value: Any) -> Any:
-        """Return a variable, which is kept in a register."""
-        from numba.core import cgutils
-
-        return cgutils.alloca_once_value(self._builder, value)
-
-    @contextmanager
-    def range(self, count: Any) -> Iterator[Any]:
-        """Repeat what is written for 0, 1, ... below count."""
-        from numba.core import cgutils
-
-        with cgutils.for_range(self._builder, count) as loop:
-            yield loop.index
-
-    def spread(self, value: Any) -> Any:
-        """Return a vector of one value, a double or a number."""
-        undefined = self._ir.VectorType(value.type, self.lanes)(self._ir.Undefined)
-        index = self._ir.IntType(32)
-        only = self._builder.insert_element(undefined, value, index(0))
-        return self._builder.shuffle_vector(
-            only, undefined, self._ir.VectorType(index, self.lanes)([0] * self.lanes))
-
-    def first(self, count: Any) -> Any:
-        """Return a mask of the first few lanes."""
-        lanes = self._ir.VectorType(self._number, self.lanes)(list(range(self.lanes)))
-        return self._builder.icmp_signed('<', lanes, self.spread(count))
-
-    def load(self, address: Any, mask: Any = None) -> Any:
-        """Return the vector that begins at an address, zero where it is masked out."""
-        address = self._builder.bitcast(address, self._type.as_pointer())
-        if mask is None:
-            return self._builder.load(address, align=_DOUBLE)
-        return self._masked('load', self._type, [address], mask, [self.zeros])
-
-    def store(self, value: Any, address: Any, mask: Any = None) -> None:
-        """Write those lanes of a vector that are not masked out."""
-        address = self._builder.bitcast(address, self._type.as_pointer())
-        if mask is None:
-            self._builder.store(value, address, align=_DOUBLE)
-        else:
-            self._masked('store', self._ir.VoidType(), [value, address], mask, [])
-
-    def _masked(self, what: str, result: Any, before: list[Any], mask: Any,
-                after: list[Any]) -> Any:
-        align = self._ir.IntType(32)(_DOUBLE)
-        arguments = [*before, align, mask, *after]
-        function = self._ir.FunctionType(result, [one.type for one in arguments])
-        own = self._builder.module.declare_intrinsic(
-            f'llvm.masked.{what}.v{self.lanes}f64.p0v{self.lanes}f64', fnty=function)
-        return self._builder.call(own, arguments)
-
-    def add(self, total: Any, left: Any, right: Any) -> None:
-        """Add the product of two vectors to a variable, rounded once where the machine can."""
-        product = self._builder.fmul(left, right, flags=('contract',))
-        self._builder.store(self._builder.fadd(self._builder.load(total), product,
-                                               flags=('contract',)), total)
-
-    def less(self, value: Any, total: Any) -> Any:
-        """Return a vector without what a variable has."""
-        return self._builder.fsub(value, self._builder.load(total))
-
-    def eliminated(self, row: Any, k: int, below: Any) -> Any:
-        """Return a row less its entry k times a vector."""
-        index = self._ir.VectorType(self._ir.IntType(32), self.lanes)([k] * self.lanes)
-        entry = self._builder.shuffle_vector(row, row, index)
-        product = self._builder.fmul(entry, below, flags=('contract',))
-        return self._builder.fsub(row, product, flags=('contract',))
-
-    def scaled(self, row: Any, factor: Any) -> Any:
-        """Return the product of two vectors."""
-        return self._builder.fmul(row, factor)
-
-    def gathered(self, entries: list[Any]) -> Any:
-        """Return a vector of doubles, one for each lane."""
-        vector = self.zeros
-        for k, entry in enumerate(entries):
-            vector = self._builder.insert_element(vector, entry, self._ir.IntType(32)(k))
-        return vector
 
 
 def loop(*takes: str, space: tuple[str, ...] = ()) -> Callable[[Kernel], Loop]:
