@@ -128,53 +128,44 @@ def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, w
         if f % _AHEAD == 0:
             seen += _read_ahead(panels, address[f:f + _AHEAD], width[f:f + _AHEAD], k)
         left = 0 if turned[f] else 1
+        right = 1 - left
         if k == _IN_SPACE:
-            for side in range(2):
-                _add_products(blocks, 2 * f + side, 2 * f + side, weights, f, own,
-                              keyframe[f, side] * k * k, k)
-            if address[f] >= 0:
-                _add_products(blocks, 2 * f + left, 2 * f + 1 - left, weights, f, panels,
-                              address[f], width[f])
+            _add_in_space(own, panels, keyframe, address, width, left, blocks, weights, f)
         else:
-            _add_small_products(blocks, weights, f, keyframe[f, 0], keyframe[f, 1], own, left,
-                                address[f], width[f], panels, scaled, size)
+            for side in range(2):
+                for r in range(k):
+                    for c in range(k):
+                        scaled[side, r, c] = weights[f, r] * blocks[f, side, r, c]
+                for r in range(k):
+                    for c in range(r + 1):
+                        total = 0.0
+                        for a in range(k):
+                            total += blocks[f, side, a, r] * scaled[side, a, c]
+                        own[keyframe[f, side], r, c] += total
+            if address[f] >= 0:
+                for r in range(k):
+                    for c in range(k):
+                        total = 0.0
+                        for a in range(k):
+                            total += blocks[f, left, a, r] * scaled[right, a, c]
+                        panels[address[f] + r * width[f] + c] += total
         if f < len(curvature):
             _add_curvature(own, panels, keyframe[f], address[f], width[f], left, curvature[f],
                            share, k)
-    for v in range(len(corner)):
-        for r in range(k):
-            for c in range(r + 1):
-                panels[corner[v] + r * stride[v] + c] = own[v, r, c]
+    _write_own(own, panels, corner, stride, k)
     return seen
 
 
 @compiled
-def _add_small_products(blocks, weights, f, i, j, own, left, at, width, panels, scaled, size):
-    """
-    Add the products of a factor's blocks to what it joins, keyframes i and j; see `assemble`.
-
-    left : whose block has the rows of the one between; scaled : (2, k, k) work space
-    """
-    k = len(size)
-    right = 1 - left
+def _add_in_space(own, panels, keyframe, address, width, left, blocks, weights, f):
+    """Add the products of the blocks of factor f, which is in space; see `assemble`."""
+    k = _IN_SPACE
     for side in range(2):
-        v = i if side == 0 else j
-        for r in range(k):
-            for c in range(k):
-                scaled[side, r, c] = weights[f, r] * blocks[f, side, r, c]
-        for r in range(k):
-            for c in range(r + 1):
-                total = 0.0
-                for a in range(k):
-                    total += blocks[f, side, a, r] * scaled[side, a, c]
-                own[v, r, c] += total
-    if at >= 0:
-        for r in range(k):
-            for c in range(k):
-                total = 0.0
-                for a in range(k):
-                    total += blocks[f, left, a, r] * scaled[right, a, c]
-                panels[at + r * width + c] += total
+        block = 2 * f + side
+        _add_products(blocks, block, block, weights, f, own, keyframe[f, side] * k * k, k)
+    if address[f] >= 0:
+        _add_products(blocks, 2 * f + left, 2 * f + 1 - left, weights, f, panels, address[f],
+                      width[f])
 
 
 def _products_tile(vectors, blocks, one, other, weights, f, to, begin, stride):
@@ -233,6 +224,15 @@ def _own_blocks(diagonal):
         for a in range(k):
             own[v, a, a] = diagonal[v, a]
     return own
+
+
+@compiled
+def _write_own(own, panels, corner, stride, k):
+    """Write the lower triangles of keyframes' own blocks to the panels, see `assemble`."""
+    for v in range(len(corner)):
+        for r in range(k):
+            for c in range(r + 1):
+                panels[corner[v] + r * stride[v] + c] = own[v, r, c]
 
 
 @compiled
