@@ -46,8 +46,8 @@ ONLINE = ('border',)
 SCANS = ('scans.kernels', 'scans.search_kernels')
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 # What poses in space need in addition: versions of a module's loops for arrays of other sizes.
-IN_SPACE = {'halpern': f'halpern{objects.SPACE}', 'cholesky': f'cholesky{objects.SPACE}',
-             'blocks': f'blocks{objects.SPACE}', 'se2': 'se3'}
+IN_SPACE = {'halpern': f'halpern{objects.SPACE}', 'blocks': f'blocks{objects.SPACE}',
+            'se2': 'se3'}
 
 # Least number of steps for each process: importing numba takes as long as one step.
 _STEPS_EACH = 3

@@ -7,144 +7,85 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Supernodal Cholesky of a sparse matrix of k x k blocks: assembly and factorisation.
+Supernodal Cholesky of a sparse matrix of k x k blocks, which `blocks.assemble` wrote.
 
 Panels are dense, row after row: entry (r, c) of panel s is panels[offset[s] + r stride[s] + c].
-Left-looking: each supernode gathers what all earlier ones subtract from it, then is factored; all
-the work is done in tiles of 2 x 3 inner products, which reuse what they load and suit blocks of
-three and of six. (Of 3 x 3, the compiler makes code that is half as fast, or worse where rows are
-short.)
-
-`size` is k zeros. As a tuple its length is known when a loop is compiled, so that loops over the
-rows of a block are unrolled; as an array it serves blocks of every other size. To factor takes no
-longer without it.
+Left-looking: each supernode gathers what all earlier ones subtract from it, then is factored. All
+the work is done in tiles of 6 rows by 8 columns, or 4: a tile stays in the processor's registers
+while what its rows have in common with its columns is summed up. Left to itself, the compiler
+makes code that is half as fast or worse.
 
 Source: Ng and Peyton, "Block sparse Cholesky algorithms on advanced uniprocessor computers"
-(1993).
+(1993); tiles: Goto and van de Geijn, "Anatomy of high-performance matrix multiplication" (2008).
 """
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import ANY_SIZE, compiled, for_sizes, loop
+from l1slam_ros.core.kernels.compiled import compiled, loop
+from l1slam_ros.core.kernels.vectors.inline import Inline
 
 # A pivot that is left with less than this part of its diagonal entry is rounding.
 _SINGULAR = 1e-13
-# As many zeros as a pose has numbers.
-_IN_PLANE, _IN_SPACE = (0,) * 3, (0,) * 6
-# Factors whose blocks are fetched at the same time.
-_AHEAD = 16
-
+# Rows and columns of a tile, and columns of a narrow one: as many sums as registers hold.
+_ROWS, _WIDE, _NARROW = 6, 8, 4
 
 _PANELS = 'f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1]'
-_FACTORS = ('f8[::1], i8[:, ::1], i8[::1], i8[::1], b1[::1], i8[::1], i8[::1], f8[:, :, :, ::1], '
-            'f8[:, ::1], f8[:, ::1], f8[:, :, :, ::1], f8')
 
 
-@for_sizes(_FACTORS, ANY_SIZE)
-def assemble(panels, keyframe, address, width, turned, corner, stride, blocks, weights, diagonal,
-             curvature, share, size):
+def _subtract_tile(vectors, left, stride, rows, right, inner, panels, place, column, columns):
     """
-    Write the lower triangle of J'WJ + diag(diagonal) + share C to the panels.
+    Subtract products of up to six rows with up to as many columns as a vector has numbers.
 
-    keyframe : (m, 2), blocks : (m, 2, k, k), see `LinearSystem`; weights : (m, k); diagonal :
-    (n, k)
-    curvature : (m', 2, k // 2, 2 k) of the first m' factors, of each the rows of the turns, the
-        last entries, of keyframe i, and of j, which are its columns, too; all else is zero. C is
-        their sum
-    address, width : (m,) where the block between the keyframes i and j of each factor lies, and
-    the stride of its panel; address -1: there is none
-    turned : (m,) bool, that block is the one of row i and column j
-    corner, stride : (n,) where each keyframe's own block begins, and its panel's stride
-
-    Returns the sum of what it read ahead, which is of no use.
+    left : those rows, of `inner` numbers each; right : (inner, lanes) the columns; panels, place,
+    column : where to subtract, see `_subtract`; of what is beyond, the last row is done again
     """
-    k = len(size)
-    for at in range(len(panels)):
-        panels[at] = 0.0
-    # Keyframes' own blocks are summed up side by side: in the panels they lie far apart, and each
-    # factor would wait for two of them.
-    own = _own_blocks(diagonal)
-    scaled, seen = np.empty((2, k, k)), 0.0
-    for f in range(len(blocks)):
-        if f % _AHEAD == 0:
-            seen += _read_ahead(panels, address[f:f + _AHEAD], width[f:f + _AHEAD], k)
-        for side in range(2):
-            for r in range(k):
-                for c in range(k):
-                    scaled[side, r, c] = weights[f, r] * blocks[f, side, r, c]
-            for r in range(k):
-                for c in range(r + 1):
-                    total = 0.0
-                    for a in range(k):
-                        total += blocks[f, side, a, r] * scaled[side, a, c]
-                    own[keyframe[f, side], r, c] += total
-        left = 0 if turned[f] else 1
-        right = 1 - left
-        if address[f] >= 0:
-            for r in range(k):
-                for c in range(k):
-                    total = 0.0
-                    for a in range(k):
-                        total += blocks[f, left, a, r] * scaled[right, a, c]
-                    panels[address[f] + r * width[f] + c] += total
-        if f < len(curvature):
-            _add_curvature(own, panels, keyframe[f], address[f], width[f], left, curvature[f],
-                           share, k)
-    for v in range(len(corner)):
-        for r in range(k):
-            for c in range(r + 1):
-                panels[corner[v] + r * stride[v] + c] = own[v, r, c]
-    return seen
+    row = vectors.indices(_ROWS, rows)
+    begin = [vectors.at(left, vectors.times(r, stride)) for r in row]
+    sums = [vectors.variable(vectors.zeros) for _ in row]
+    with vectors.range(inner) as q:
+        factor = vectors.load(vectors.at(right, vectors.times(q, vectors.lanes)))
+        for total, numbers in zip(sums, begin, strict=True):
+            vectors.add(total, vectors.spread(vectors.entry(numbers, q)), factor)
+    mask = vectors.first(columns)
+    # All are read before any is written, for the last row may be there more than once.
+    to = [vectors.at(vectors.at(panels, vectors.entry(place, r)), column) for r in row]
+    was = [vectors.load(where, mask) for where in to]
+    for where, value, total in zip(to, was, sums, strict=True):
+        vectors.store(vectors.less(value, total), where, mask)
 
 
-@compiled
-def _add_curvature(own, panels, keyframe, at, width, left, curvature, share, k):
+def _solve_tile(vectors, panels, place, rows, column, columns, corner):
     """
-    Add a factor's curvature to its keyframes' own blocks, and to the one between, if it has one.
+    Solve for up to six rows and the columns of a factored corner.
 
-    keyframe : (2,); at, width, left : of its block, see `assemble`; curvature : (2, k // 2, 2 k)
+    corner : (lanes + 1, lanes) each column of the corner below its diagonal over the entry there,
+    and one over all these entries
     """
-    # Of three and of six numbers a step turns by one and by three.
-    still = k - k // 2
-    for side in range(2):
-        for r in range(still, k):
-            for c in range(r + 1):
-                own[keyframe[side], r, c] += share * curvature[side, r - still, side * k + c]
-    if at < 0:
-        return
-    right = 1 - left
-    for r in range(still):
-        for c in range(still, k):
-            panels[at + r * width + c] += share * curvature[right, c - still, left * k + r]
-    for r in range(still, k):
-        for c in range(k):
-            panels[at + r * width + c] += share * curvature[left, r - still, right * k + c]
+    row = vectors.indices(_ROWS, rows)
+    mask = vectors.first(columns)
+    to = [vectors.at(vectors.at(panels, vectors.entry(place, r)), column) for r in row]
+    found = [vectors.load(where, mask) for where in to]
+    for k in range(vectors.lanes):
+        below = vectors.load(vectors.at(corner, vectors.lanes * k))
+        found = [vectors.eliminated(one, k, below) for one in found]
+    inverse = vectors.load(vectors.at(corner, vectors.lanes**2))
+    for where, one in zip(to, found, strict=True):
+        vectors.store(vectors.scaled(one, inverse), where, mask)
 
 
-@compiled
-def _own_blocks(diagonal):
-    """Return a block for each keyframe, with this diagonal, and one for what is held fixed."""
-    n, k = diagonal.shape
-    own = np.zeros((n + 1, k, k))
-    for v in range(n):
-        for a in range(k):
-            own[v, a, a] = diagonal[v, a]
-    return own
+def _pack_tile(vectors, source, stride, rows, inner, packed):
+    """Write up to as many rows as a vector has numbers as columns, (inner, lanes)."""
+    begin = [vectors.at(source, vectors.times(r, stride))
+             for r in vectors.indices(vectors.lanes, rows)]
+    with vectors.range(inner) as q:
+        numbers = [vectors.entry(one, q) for one in begin]
+        vectors.store(vectors.gathered(numbers),
+                      vectors.at(packed, vectors.times(q, vectors.lanes)))
 
 
-@compiled
-def _read_ahead(panels, address, width, k):
-    """
-    Return the sum of a number of each row of some blocks.
-
-    They lie anywhere in memory. Read one right after the other, they are fetched at the same time;
-    and a sum that is returned is not left out by the compiler.
-    """
-    seen = 0.0
-    for f in range(len(address)):
-        for r in range(k):
-            seen += panels[max(address[f], 0) + r * width[f]]
-    return seen
+_subtract_wide, _subtract_narrow = (Inline(_subtract_tile, lanes) for lanes in (_WIDE, _NARROW))
+_pack_wide, _pack_narrow = (Inline(_pack_tile, lanes) for lanes in (_WIDE, _NARROW))
+_solve_wide, _solve_narrow = (Inline(_solve_tile, lanes) for lanes in (_WIDE, _NARROW))
 
 
 @loop(f'({_PANELS}, i4[::1], i1[::1], i8, i4[:, ::1], i8[::1], i8)')
@@ -165,6 +106,7 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
     tallest = d * _begin_share(reach, start, pattern, owner, share, mine, lists)
     place, target = np.empty(tallest, np.int64), np.empty(tallest, np.int64)
     least = np.empty(tallest)
+    packed = np.zeros(_WIDE * (tallest + _WIDE + 1))
     for s in range(count):
         if share[s] != mine:
             continue
@@ -180,24 +122,38 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
             inner = (first[source + 1] - first[source]) * d
             top = offset[source] + reach[source] * d * stride[source]
             columns = _within(rows, first[s + 1])
-            # Row by row of the blocks: a loop over so few rows takes longer than what it does.
-            for a in range(d):
-                for k in range(len(rows)):
-                    place[k * d + a] = local[rows[k]] + a * stride[s]
-                for k in range(columns):
-                    target[k * d + a] = (rows[k] - first[s]) * d + a
+            _find_places(rows, columns, local, first[s], stride[s], d, place, target)
             _subtract(panels[top:], stride[source], inner, len(rows) * d, columns * d, panels,
-                      place, target)
+                      place, target, packed)
             reach[source] += columns
             _enqueue(source, reach, start, pattern, owner, share, mine, lists)
             source = next_source
-        panel = panels[offset[s]:offset[s + 1]]
-        bad = _factorise_panel(panel, stride[s], (start[s + 1] - start[s]) * d, width, least)
+        height = (start[s + 1] - start[s]) * d
+        for r in range(height):
+            place[r] = offset[s] + r * stride[s]
+            target[r] = r
+        bad = _factorise_panel(panels, stride[s], height, width, least, place, target, packed)
         if bad < width:
             return first[s] + bad // d
         reach[s] = first[s + 1] - first[s]
         _enqueue(s, reach, start, pattern, owner, share, mine, lists)
     return n
+
+
+@compiled
+def _find_places(rows, columns, local, first, stride, d, place, target):
+    """
+    Write where a source's rows begin in another one's panel, and which of its columns are which.
+
+    rows : (blocks,) positions, the first `columns` of them the panel's own; local : of each
+    position where it begins; place, target : see `_subtract`
+    """
+    # Row by row of the blocks: a loop over so few rows takes longer than what it does.
+    for a in range(d):
+        for k in range(len(rows)):
+            place[k * d + a] = local[rows[k]] + a * stride
+        for k in range(columns):
+            target[k * d + a] = (rows[k] - first) * d + a
 
 
 @compiled
@@ -236,123 +192,80 @@ def _enqueue(source, reach, start, pattern, owner, share, mine, lists):
 
 
 @compiled
-def _subtract(source, stride, inner, height, columns, panels, place, target):
+def _subtract(source, stride, inner, height, columns, panels, place, target, packed):
     """
-    Subtract products of a source's rows, from `top` on, from the panel that they belong to.
+    Subtract products of a source's first rows from the panel that they belong to.
 
     place : (height,) where each of the rows begins in the target's panel; target : (columns,) the
-    column of that panel that belongs to each of the first rows
+    column of that panel that belongs to each of the first rows; packed : work space
     """
-    for c in range(0, columns, 3):
-        c1, c2 = min(c + 1, columns - 1), min(c + 2, columns - 1)
-        right = (source[c * stride:c * stride + inner], source[c1 * stride:c1 * stride + inner],
-                 source[c2 * stride:c2 * stride + inner])
-        for r in range(c, height, 2):
-            r1 = min(r + 1, height - 1)
-            left = source[r * stride:r * stride + inner], source[r1 * stride:r1 * stride + inner]
-            # Most panels of sparse graphs are as wide as a block of a pose.
-            if inner == 3:
-                tile = _tile(left, right, _IN_PLANE)
-            elif inner == 6:
-                tile = _tile(left, right, _IN_SPACE)
+    c = 0
+    while c < columns:
+        end = c + 1
+        while end < min(c + _WIDE, columns) and target[end] == target[end - 1] + 1:
+            end += 1
+        is_wide = end - c > _NARROW
+        if is_wide:
+            _pack_wide(source[c * stride:], stride, end - c, inner, packed)
+        else:
+            _pack_narrow(source[c * stride:], stride, end - c, inner, packed)
+        for r in range(c, height, _ROWS):
+            left, rows, to = source[r * stride:], min(_ROWS, height - r), place[r:]
+            if is_wide:
+                _subtract_wide(left, stride, rows, packed, inner, panels, to, target[c], end - c)
             else:
-                tile = _tile(left, right, left[0])
-            _write(panels[place[r]:], target[c], target[c1], target[c2], c1 > c, c2 > c1, tile[0])
-            if r1 > r:
-                _write(panels[place[r1]:], target[c], target[c1], target[c2], c1 > c, c2 > c1,
-                       tile[1])
+                _subtract_narrow(left, stride, rows, packed, inner, panels, to, target[c],
+                                 end - c)
+        c = end
 
 
 @compiled
-def _write(row, t0, t1, t2, has_second, has_third, values):
-    """Subtract up to three values from a row of a panel."""
-    row[t0] -= values[0]
-    if has_second:
-        row[t1] -= values[1]
-    if has_third:
-        row[t2] -= values[2]
-
-
-@compiled
-def _tile(left, right, along):
-    """
-    Return the six inner products of two rows with three rows, each as long as `along`.
-
-    A row, or a tuple, whose length the compiler knows: then the loop is unrolled.
-    """
-    left0, left1 = left
-    right0, right1, right2 = right
-    s00 = s01 = s02 = s10 = s11 = s12 = 0.0
-    for q in range(len(along)):
-        x0, x1 = left0[q], left1[q]
-        y0, y1, y2 = right0[q], right1[q], right2[q]
-        s00 += x0 * y0
-        s01 += x0 * y1
-        s02 += x0 * y2
-        s10 += x1 * y0
-        s11 += x1 * y1
-        s12 += x1 * y2
-    return (s00, s01, s02), (s10, s11, s12)
-
-
-@compiled
-def _factorise_panel(panel, stride, height, width, least):
+def _factorise_panel(panels, stride, height, width, least, place, target, packed):
     """
     Factor the diagonal block of a panel and solve for the rest; return the bad column.
 
-    least : (width,) what each pivot must exceed
+    least : (width,) what each pivot must exceed; place : (height,) where its rows begin; target :
+    0, 1, 2, ...
     """
-    for c in range(0, width, 3):
-        strip = min(3, width - c)
+    for c in range(0, width, _WIDE):
+        columns = min(_WIDE, width - c)
+        begin = place[c]
         if c:
-            _update_strip(panel, stride, height, width, c, strip)
-        at = c * stride + c
-        for k in range(strip):
-            pivot = panel[at + k * stride + k]
-            for q in range(k):
-                pivot -= panel[at + k * stride + q] ** 2
-            if not pivot > max(least[c + k], 0.0):
-                return c + k
-            panel[at + k * stride + k] = np.sqrt(pivot)
-            for r in range(k + 1, strip):
-                value = panel[at + r * stride + k]
-                for q in range(k):
-                    value -= panel[at + r * stride + q] * panel[at + k * stride + q]
-                panel[at + r * stride + k] = value / panel[at + k * stride + k]
-        _solve_strip(panel[at + strip * stride:], panel[at:], height - c - strip, stride, strip)
+            _subtract(panels[begin:], stride, c, height - c, columns, panels, place[c:],
+                      target[c:], packed)
+        lanes = _WIDE if columns > _NARROW else _NARROW
+        bad = _factorise_corner(panels[begin + c:], stride, columns, least[c:], lanes, packed)
+        if bad < columns:
+            return c + bad
+        for r in range(c + columns, height, _ROWS):
+            rows = min(_ROWS, height - r)
+            if lanes == _WIDE:
+                _solve_wide(panels, place[r:], rows, c, columns, packed)
+            else:
+                _solve_narrow(panels, place[r:], rows, c, columns, packed)
     return width
 
 
 @compiled
-def _update_strip(panel, stride, height, width, c, strip):
-    """Subtract from up to three columns what the columns before them do."""
-    c1, c2 = min(c + 1, width - 1), min(c + 2, width - 1)
-    right = (panel[c * stride:c * stride + c], panel[c1 * stride:c1 * stride + c],
-             panel[c2 * stride:c2 * stride + c])
-    for r in range(c, height, 2):
-        r1 = min(r + 1, height - 1)
-        left = panel[r * stride:r * stride + c], panel[r1 * stride:r1 * stride + c]
-        tile = _tile(left, right, left[0])
-        _write(panel[r * stride:], c, c1, c2, strip > 1, strip > 2, tile[0])
-        if r1 > r:
-            _write(panel[r1 * stride:], c, c1, c2, strip > 1, strip > 2, tile[1])
-
-
-@compiled
-def _solve_strip(below, diagonal, height, stride, strip):
-    """Solve for the rows below a factored block of one to three columns."""
-    f00, f10, f11, f20, f21, f22 = 1 / diagonal[0], 0.0, 0.0, 0.0, 0.0, 0.0
-    if strip > 1:
-        f10, f11 = diagonal[stride], 1 / diagonal[stride + 1]
-    if strip > 2:
-        f20, f21 = diagonal[2 * stride], diagonal[2 * stride + 1]
-        f22 = 1 / diagonal[2 * stride + 2]
-    for r in range(height):
-        row = below[r * stride:r * stride + strip]
-        x = row[0] * f00
-        row[0] = x
-        if strip > 1:
-            y = (row[1] - x * f10) * f11
-            row[1] = y
-            if strip > 2:
-                row[2] = (row[2] - x * f20 - y * f21) * f22
+def _factorise_corner(corner, stride, width, least, lanes, packed):
+    """Factor a diagonal block of a few columns, and pack it for `_solve_tile`; as above."""
+    for k in range(lanes * (lanes + 1)):
+        packed[k] = 0.0
+    inverse = packed[lanes * lanes:]
+    for k in range(width):
+        pivot = corner[k * (stride + 1)]
+        for q in range(k):
+            pivot -= corner[k * stride + q] ** 2
+        if not pivot > max(least[k], 0.0):
+            return k
+        root = np.sqrt(pivot)
+        inverse[k] = 1 / root
+        corner[k * (stride + 1)] = root
+        for r in range(k + 1, width):
+            value = corner[r * stride + k]
+            for q in range(k):
+                value -= corner[r * stride + q] * corner[k * stride + q]
+            value *= inverse[k]
+            corner[r * stride + k] = value
+            packed[k * lanes + r] = value * inverse[k]
+    return width

@@ -19,7 +19,7 @@ import numpy as np
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
 # A panel may hold this part of zeros for the sake of being larger.
-_ZEROS = 0.2
+_ZEROS = 0.1
 
 
 @loop('(i4[::1], i8[::1], i4[::1])')
@@ -268,7 +268,7 @@ def block_addresses(keyframe, position, first, start, pattern, offset, stride, k
     Returns
     -------
     address, width, turned : of the block between the keyframes of each factor, (m,) each, see
-        `cholesky.assemble`
+        `blocks.assemble`
     corner, own : where each keyframe's own block begins and its panel's stride, (n,)
 
     """

@@ -235,8 +235,8 @@ class BlockCholesky:
         if len(self._loose):
             own = system.diagonal(weights).reshape(-1, k)[self._loose]
             added[self._loose] += np.where(own > 0, _LOOSE * own, 1.0)
-        kernels.cholesky.assemble(layout.panels, self._keyframe, *layout.places, system.blocks,
-                                  weights.reshape(-1, k), added, curvature, share, layout.size)
+        kernels.blocks.assemble(layout.panels, self._keyframe, *layout.places, system.blocks,
+                                weights.reshape(-1, k), added, curvature, share, layout.size)
         self._factored = layout
         return self._factorise(layout) == system.size
 
@@ -308,7 +308,7 @@ class _Layout:
 
     panels : all entries; shape : what describes the panels to the kernels; places : where in them
     the blocks of factors and keyframes are, see `kernels.symbolic.block_addresses`; size : see
-    `kernels.cholesky`.
+    `kernels.blocks`.
     """
 
     def __init__(self, pattern: Pattern, keyframe: Indices, block_size: int):

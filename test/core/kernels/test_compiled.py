@@ -27,7 +27,7 @@ import numpy as np
 from l1slam_ros.core.kernels import compiled, symbolic
 assert compiled.__file__.startswith({folder!r}), compiled.__file__
 parent, below = np.array([1, 2, 3], np.int32), np.array([1, 1, 0], np.int32)
-assert symbolic.supernodes(parent, below).tolist() == [0, 3]
+assert symbolic.supernodes(parent, below).tolist() == [0, 1, 3]
 stats = symbolic.supernodes.dispatcher.stats
 print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
 """
