@@ -66,7 +66,12 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
-from l1slam_ros.core.robust.innovation import chi2_quantile, covariances, spread_of
+from l1slam_ros.core.robust.innovation import (
+    BY_CHANCE,
+    chi2_quantile,
+    covariances,
+    spread_of,
+)
 from l1slam_ros.core.robust.judgement import (
     NORM,
     UNSOLVED,
@@ -80,7 +85,6 @@ from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, likeliest, st
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
-from l1slam_ros.core.robust.rounds.evidence import REFUSED
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
@@ -277,7 +281,7 @@ def _norm_doubts(graph: FactorGraph, judgement: Judgement, whole: FactorGraph, s
     spread = covariances(spread_of(whole, seed, cholesky_of(whole), noise))
     step = manifold.local(seed, poses)[len(poses) - len(spread):]
     square = kernels.prediction.normalise(spread, step)[0]
-    explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
+    explained = (np.pi / 2 - 1) * chi2_quantile(1 - BY_CHANCE, np.array([manifold.TANGENT_SIZE]))
     if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
         return ()
     loops = graph.between.pairs[judgement.accepted & ~graph.between.is_odometry]

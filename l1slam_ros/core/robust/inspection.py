@@ -34,6 +34,7 @@ from l1slam_ros.core.graph.linear_system import (
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key, tree_poses
 from l1slam_ros.core.graph.world_frame import placed
+from l1slam_ros.core.robust.innovation import BY_CHANCE
 from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 
 # A step this many times as long as nine in ten of all steps is no step of the same robot.
@@ -50,9 +51,9 @@ _TOLERANCE = 1e-3
 _SAME_RATIO = 0.01
 # Errors that many times as large, or as small, as their information says are worth a sentence.
 OFF_SCALE = 3.0
-# An offset that loops share is one that noise makes in so few graphs, and larger than the noise of
-# one loop; where a smaller part of it shows in the residuals, the map bends as well.
-_CHANCE, _SHOWS = 1e-3, 0.1
+# An offset that loops share is larger than the noise of one; where a smaller part of it than this
+# shows in the residuals, the map bends as well.
+_SHOWS = 0.1
 
 
 def repeated_factors(graph: FactorGraph) -> Indices:
@@ -204,7 +205,7 @@ def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
     # Multiplied out: exact measurements leave nothing to divide by.
     found, noise = before[:, 0] @ before[:, 0], after @ after
     spare = is_loop.sum() * k - len(share)  # the ratio of likelihoods, as the noise is found, too
-    likely = spare * np.expm1(2 * gamma_quantile(len(share) / 2, 1 - _CHANCE) / spare)
+    likely = spare * np.expm1(2 * gamma_quantile(len(share) / 2, 1 - BY_CHANCE) / spare)
     is_sure = d @ S @ d * found > likely * noise
     is_large = d @ M @ d * found > is_loop.sum() * noise
     fits = variance[1] * noise <= OFF_SCALE**2 * found
