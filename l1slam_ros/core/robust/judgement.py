@@ -30,6 +30,7 @@ from l1slam_ros.core.robust.forecast import (
     unsureness,
 )
 from l1slam_ros.core.robust.odometry.drift import straightened
+from l1slam_ros.core.robust.pairwise_consistency import RUN
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds.growth import Growth
 
@@ -51,8 +52,6 @@ NORM = 'another norm'
 FAILED = 'judging failed'
 UNSOLVED = 'solving failed'
 PARTS = 'parts'
-# Of fewer loops nothing is recorded.
-HANDFUL = 5
 
 
 @dataclass(frozen=True)
@@ -230,14 +229,15 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
                      *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
     confidence = forecast(terms) if loops.any() else float('nan')
     left_out = np.flatnonzero(loops & ~accepted)
-    # Where all loops came in, what the file states may be vague; there is nothing to settle.
-    if (settled and len(left_out) and np.count_nonzero(loops) >= HANDFUL
+    # Where all loops came in, what the file states may be vague; there is nothing to settle. Of
+    # fewer loops than a run has nothing is recorded.
+    if (settled and len(left_out) and np.count_nonzero(loops) >= RUN
             and forecast(terms[:3]) < CONFIDENT):
         metres = unsure * right_within(growth.given.graph.manifold.positions(growth.poses))
         reasons += (doubt_of(given.factors.pairs[left_out], growth.given.graph.n_poses, WEAK,
                              f'{metres:.2g}'),)
     doubted = OTHER_MAP in kinds or bool(
-        2 * len(left_out) > np.count_nonzero(loops) >= HANDFUL)
+        2 * len(left_out) > np.count_nonzero(loops) >= RUN)
     return Judgement(accepted, suspect[:size], sigmas, growth.noise.variance,
                      _noise(growth)[:size], slips, reasons, settled, confidence=confidence,
                      terms=terms, is_refusal_doubted=doubted)

@@ -26,7 +26,6 @@ from l1slam_ros.core.robust.forecast import drift_taken_for_noise
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
-    HANDFUL,
     ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
@@ -38,6 +37,7 @@ from l1slam_ros.core.robust.judgement import (
 )
 from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
 from l1slam_ros.core.robust.pairwise_consistency import (
+    RUN,
     agree_at_a_place,
     longest_run,
     runs,
@@ -83,7 +83,7 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
     As one loop, by the median of what they say, it would not be believed by odometry alone.
     """
     given = growth.given
-    if (len(accepted) < HANDFUL or not given.may_err_as_one(accepted, TWO_PLACES)
+    if (len(accepted) < RUN or not given.may_err_as_one(accepted, TWO_PLACES)
             or (given.trusted | given.factors.is_absolute)[accepted].any()):
         return False
     odometry = growth.copy()
