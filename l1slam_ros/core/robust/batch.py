@@ -80,6 +80,7 @@ from l1slam_ros.core.robust.judgement import (
     doubt_of,
     judgement_of,
     listed,
+    so_far,
 )
 from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, likeliest, straightened
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
@@ -121,18 +122,18 @@ def robust_solve(
 
     """
     first = growth = Growth(graph, check)
-    so_far = _so_far(first)
+    last = so_far(first), first.poses
     number = 0
     repair = _Repair(graph, check)
     try:
         first.begin()
         for number, growth in enumerate(rounds(first, repair), 1):
-            so_far = _so_far(growth, repair.drift)
+            last = so_far(growth, repair.drift), growth.poses
             report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
-        judgement = judgement_of(growth, doubts(growth, number < _MOST_ROUNDS, repair.rival))
-        return replace(judgement, drift=repair.drift), growth.poses
+        reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival)
+        return judgement_of(growth, reasons, drift=repair.drift), growth.poses
     except _FAILURES as error:
-        judgement, poses = known or so_far
+        judgement, poses = known or last
         return judgement.broken_off(graph, error), poses
 
 
@@ -179,17 +180,6 @@ class _Repair:
         for _ in rounds(growth, lambda *states: ends.append(Straight(drift, *states))):
             self._check()
         return ends
-
-
-def _so_far(growth: Growth, drift: float = 0.0) -> Believed:
-    """Return what a state believes, to fall back on; the loops that it left out are suspect."""
-    given = growth.given
-    size = given.size
-    slip = growth.cut & ~given.gap
-    accepted = (growth.accepted & ~slip)[:size]
-    return Judgement(accepted, given.is_loop[:size] & ~accepted, np.full(size, np.nan),
-                     growth.noise.variance.copy(), np.ones(size), np.flatnonzero(slip[:size]),
-                     drift=drift), growth.poses
 
 
 @dataclass(frozen=True)
@@ -349,6 +339,6 @@ def judge(
                 settled = False
                 break
         reasons = doubts(growth) if settled else ()
-        return replace(judgement_of(growth, reasons, settled), drift=known.drift), growth.poses
+        return judgement_of(growth, reasons, settled, known.drift), growth.poses
     except _FAILURES as error:
         return known.broken_off(graph, error), poses

@@ -33,7 +33,6 @@ from l1slam_ros.core.robust.judgement import (
     UNFINISHED,
     Doubt,
     doubt_of,
-    listed,
 )
 from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
 from l1slam_ros.core.robust.pairwise_consistency import (
@@ -214,6 +213,5 @@ def _slip_doubt(growth: Growth, step: int) -> Doubt:
     given = growth.given
     span = given.spanning(step)
     used = growth.accepted & span
-    across = given.factors.pairs[used if used.any() else span]
-    return Doubt(SLIP, len(across), int(given.low[step]), int(given.high[step]),
-                 pairs=listed(across))
+    doubt = _doubt(growth, SLIP, np.flatnonzero(used if used.any() else span))
+    return replace(doubt, first=int(given.low[step]), last=int(given.high[step]))
