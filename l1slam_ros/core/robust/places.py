@@ -27,7 +27,7 @@ from l1slam_ros.core.robust.innovation import BY_CHANCE
 
 # Linked are loops whose ends lie within so many metres along the way, in sum, or within the length
 # of so many ordinary steps, where keyframes are far apart; and what they claim, too.
-_NEAR = 5.0
+NEAR = 5.0
 _NEAR_STEPS = 10
 # Claims are told apart to this part of it, so that a robot that stands has few different ones.
 _GRAIN = 0.1
@@ -78,7 +78,7 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     # The world is where the way begins, as WORLD finds it: last.
     way = np.concatenate(([0.0], np.cumsum(steps), [0.0]))
-    near = max(_NEAR, _NEAR_STEPS * float(np.median(steps)) if len(steps) else 0.0)
+    near = max(NEAR, _NEAR_STEPS * float(np.median(steps)) if len(steps) else 0.0)
     ends = np.stack((way[high] + way[low], way[high] - way[low]), axis=1) / near
     claimed = manifold.compose(with_world(manifold, chain)[low], Z)
     claim = manifold.positions(claimed) - positions[high]
