@@ -75,11 +75,6 @@ class Posterior:
         """Of each factor, whitened, (m, k)."""
         return -self.system.b.reshape(len(self.system.blocks), -1)
 
-    @property
-    def is_checked(self) -> Mask:
-        """(m,) bool: the factors of which any other one says something."""
-        return np.asarray(np.trace(self.moment, axis1=1, axis2=2) > _REDUNDANT)
-
     def left_over(self, rows: Indices) -> Array:
         """Return what the noise makes of the residuals of some factors, (l, k, q)."""
         system = self.system
@@ -96,7 +91,8 @@ class Posterior:
         """
         moment = filled(self.moment, ~self.speaks).copy()
         square: Array = kernels.prediction.normalise(moment, self.residual)[0]
-        return np.where(self.is_checked & np.isfinite(square), square, 0.0)
+        alone = np.trace(self.moment, axis1=1, axis2=2) < _REDUNDANT
+        return np.where(alone | ~np.isfinite(square), 0.0, square)
 
 
 def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,

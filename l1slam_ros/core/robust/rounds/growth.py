@@ -50,8 +50,10 @@ _TAIL = 2.0
 # What is measured of the noise counts against as many factors on which it was measured before.
 _KNOWN = 20
 # Noise that is so many times the variance that was found is measured anew before any loop is
-# dropped for it.
+# dropped for it, by the median of chi2 over its freedom; by factors that others check at all.
 _NOISIER = 3.0
+_MEDIAN = 0.79
+_CHECKED = 0.01
 # While driving so many of the last absolute factors are looked at, with their neighbours.
 _LATEST = 50
 # The variance of an odometry factor that was cut, in units of its own: loops alone decide, and far
@@ -267,9 +269,9 @@ class Growth:
             return False
         square = (self.posterior.residual**2).sum(axis=1)
         stated = np.trace(self.posterior.moment, axis1=1, axis2=2)
-        known = self.posterior.is_checked & ~self.given.factors.is_absolute[rows]
+        known = (stated > _CHECKED) & ~self.given.factors.is_absolute[rows]
         scale = np.array([np.median(square[known & kind] / stated[known & kind])
-                          if (known & kind).any() else 0.0 for kind in (~loops, loops)])
+                          if (known & kind).any() else 0.0 for kind in (~loops, loops)]) / _MEDIAN
         noisier = scale > _NOISIER
         self.noise = self.noise.found(np.where(noisier, scale, 1.0) * self.noise.variance)
         return bool(noisier.any())
