@@ -18,7 +18,7 @@ the covariance of the residual of one inside. All samples together cost a few or
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from math import lgamma
 
 import numpy as np
@@ -307,14 +307,20 @@ def claimed_volume(manifold: Manifold, poses: Array) -> Array:
     Return the logarithm of the volume that the claims of false factors fill, (k,) its factors.
 
     That of a Gaussian, (2 pi)^(k/2) sqrt(det M), as wide in each direction as the positions of
-    random pairs lie apart (a false factor need not know of the corridor), with any rotation: the
-    mean square of a difference is twice the variance.
+    random pairs lie apart (a false factor need not know of the corridor), with any rotation.
     """
+    others = _others(len(poses))
     positions = manifold.positions(poses)
     variance = np.full(manifold.TANGENT_SIZE, np.pi**2 / 3)
-    variance[manifold.TRANSLATION] = 2 * positions.var(axis=0).mean()
+    variance[manifold.TRANSLATION] = ((positions[others] - positions) ** 2).mean()
     with np.errstate(divide='ignore'):
         return np.log(2 * np.pi * variance) / 2
+
+
+@lru_cache(maxsize=1)
+def _others(n: int) -> Indices:
+    """Return for each of n keyframes another one, at random, (n,): each round asks for these."""
+    return np.random.default_rng(0).permutation(n)
 
 
 def chi2_quantile(probability: float, freedom: Indices) -> Array:
