@@ -66,7 +66,12 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
-from l1slam_ros.core.robust.innovation import chi2_quantile, covariances, spread_of
+from l1slam_ros.core.robust.innovation import (
+    BY_CHANCE,
+    chi2_quantile,
+    covariances,
+    spread_of,
+)
 from l1slam_ros.core.robust.judgement import (
     NORM,
     UNSOLVED,
@@ -75,12 +80,12 @@ from l1slam_ros.core.robust.judgement import (
     doubt_of,
     judgement_of,
     listed,
+    so_far,
 )
 from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, likeliest, straightened
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
-from l1slam_ros.core.robust.rounds.evidence import REFUSED
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
@@ -117,18 +122,18 @@ def robust_solve(
 
     """
     first = growth = Growth(graph, check)
-    so_far = _so_far(first)
+    last = so_far(first), first.poses
     number = 0
     repair = _Repair(graph, check)
     try:
         first.begin()
         for number, growth in enumerate(rounds(first, repair), 1):
-            so_far = _so_far(growth, repair.drift)
+            last = so_far(growth, repair.drift), growth.poses
             report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
-        judgement = judgement_of(growth, doubts(growth, number < _MOST_ROUNDS, repair.rival))
-        return replace(judgement, drift=repair.drift), growth.poses
+        reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival)
+        return judgement_of(growth, reasons, drift=repair.drift), growth.poses
     except _FAILURES as error:
-        judgement, poses = known or so_far
+        judgement, poses = known or last
         return judgement.broken_off(graph, error), poses
 
 
@@ -175,17 +180,6 @@ class _Repair:
         for _ in rounds(growth, lambda *states: ends.append(Straight(drift, *states))):
             self._check()
         return ends
-
-
-def _so_far(growth: Growth, drift: float = 0.0) -> Believed:
-    """Return what a state believes, to fall back on; the loops that it left out are suspect."""
-    given = growth.given
-    size = given.size
-    slip = growth.cut & ~given.gap
-    accepted = (growth.accepted & ~slip)[:size]
-    return Judgement(accepted, given.is_loop[:size] & ~accepted, np.full(size, np.nan),
-                     growth.noise.variance.copy(), np.ones(size), np.flatnonzero(slip[:size]),
-                     drift=drift), growth.poses
 
 
 @dataclass(frozen=True)
@@ -277,7 +271,7 @@ def _norm_doubts(graph: FactorGraph, judgement: Judgement, whole: FactorGraph, s
     spread = covariances(spread_of(whole, seed, cholesky_of(whole), noise))
     step = manifold.local(seed, poses)[len(poses) - len(spread):]
     square = kernels.prediction.normalise(spread, step)[0]
-    explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
+    explained = (np.pi / 2 - 1) * chi2_quantile(1 - BY_CHANCE, np.array([manifold.TANGENT_SIZE]))
     if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
         return ()
     loops = graph.between.pairs[judgement.accepted & ~graph.between.is_odometry]
@@ -345,6 +339,6 @@ def judge(
                 settled = False
                 break
         reasons = doubts(growth) if settled else ()
-        return replace(judgement_of(growth, reasons, settled), drift=known.drift), growth.poses
+        return judgement_of(growth, reasons, settled, known.drift), growth.poses
     except _FAILURES as error:
         return known.broken_off(graph, error), poses

@@ -37,9 +37,6 @@ _OFF, _OFF_PART = 0.25, 0.005
 # A map that is surer of itself than by this factor is no more likely to be right; half and double
 # change no doubt.
 _SUREST = 0.3
-# [sigmas] A drift counts from here on, where the map is less sure of itself than a right one is
-# exact.
-_SURE_DRIFT = 3.5
 
 
 def forecast(terms: Array) -> float:
@@ -116,6 +113,11 @@ def left_drift(growth: Growth) -> tuple[float, float]:
 
 
 def drift_taken_for_noise(growth: Growth) -> float:
-    """Return `left_drift` [rad/m] where it is sure and bends a map that is not; else 0."""
+    """
+    Return `left_drift` [rad/m] where noise hardly made it and it bends an unsure map; else 0.
+
+    Unsure is a map that is less sure of itself than a right one is exact.
+    """
     drift, sigmas = left_drift(growth)
-    return 0.0 if abs(sigmas) < _SURE_DRIFT or unsureness(growth) < 1 else drift
+    is_noise = sigmas**2 < growth.given.gate(np.array([1]))[0]
+    return 0.0 if is_noise or unsureness(growth) < 1 else drift

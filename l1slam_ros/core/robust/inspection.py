@@ -34,6 +34,7 @@ from l1slam_ros.core.graph.linear_system import (
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key, tree_poses
 from l1slam_ros.core.graph.world_frame import placed
+from l1slam_ros.core.robust.innovation import BY_CHANCE
 from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 
 # A step this many times as long as nine in ten of all steps is no step of the same robot.
@@ -42,17 +43,15 @@ _LONG = 10.0
 _PART = 2000
 # Fewer spare measurements than this tell nothing of their noise.
 FEWEST_SPARE = 20
-_ROUNDS = 8
-# The poses need not be exact for their residuals to have the right size: steps of Gauss-Newton at
-# most, each halved so often, and the part of chi2 that no longer matters; nor the ratios.
-_STEPS, _HALVINGS = 20, 5
-_TOLERANCE = 1e-3
-_SAME_RATIO = 0.01
+# Poses need not be exact for their residuals to have the right size, nor ratios: steps at most,
+# and the part of chi2, or of a ratio, that no longer matters.
+_STEPS = 20
+_TOLERANCE = 0.01
 # Errors that many times as large, or as small, as their information says are worth a sentence.
 OFF_SCALE = 3.0
-# An offset that loops share is one that noise makes in so few graphs, and larger than the noise of
-# one loop; where a smaller part of it shows in the residuals, the map bends as well.
-_CHANCE, _SHOWS = 1e-3, 0.1
+# An offset that loops share is larger than the noise of one; where a smaller part of it than this
+# shows in the residuals, the map bends as well.
+_SHOWS = 0.1
 
 
 def repeated_factors(graph: FactorGraph) -> Indices:
@@ -154,13 +153,13 @@ def noise_scales(graph: FactorGraph, rng: 'np.random.Generator') -> NoiseScales:
     def left_of(b: Array) -> Array:
         return b - system.A @ _least_squares(system, b, 1 / variance[group])
 
-    for _ in range(_ROUNDS):
+    for _ in range(_STEPS):
         left = left_of(np.stack((system.b, np.sqrt(variance)[group] * noise), axis=1))
         found, drawn = (np.bincount(group, column**2, minlength=2) for column in left.T)
         spare = drawn / variance
         ratio = np.divide(found, drawn, out=np.ones(2), where=spare >= FEWEST_SPARE)
         variance = np.clip(variance * ratio, 1e-12, 1e12)
-        if (np.abs(ratio - 1) < _SAME_RATIO).all():
+        if (np.abs(ratio - 1) < _TOLERANCE).all():
             break
     odometry, loops = np.where(spare >= FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
     known = (spare >= FEWEST_SPARE).all()
@@ -204,7 +203,7 @@ def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
     # Multiplied out: exact measurements leave nothing to divide by.
     found, noise = before[:, 0] @ before[:, 0], after @ after
     spare = is_loop.sum() * k - len(share)  # the ratio of likelihoods, as the noise is found, too
-    likely = spare * np.expm1(2 * gamma_quantile(len(share) / 2, 1 - _CHANCE) / spare)
+    likely = spare * np.expm1(2 * gamma_quantile(len(share) / 2, 1 - BY_CHANCE) / spare)
     is_sure = d @ S @ d * found > likely * noise
     is_large = d @ M @ d * found > is_loop.sum() * noise
     fits = variance[1] * noise <= OFF_SCALE**2 * found
@@ -268,15 +267,12 @@ def _l2_poses(graph: FactorGraph) -> Array:
         poses = step_part(graph, poses, _least_squares(system, system.b), part)
     system = _system(graph, poses)
     for _ in range(_STEPS):
-        step, chi2 = _least_squares(system, system.b), l2_cost(system.b)
-        for halvings in range(_HALVINGS + 1):
-            candidate = step_poses(graph, poses, step / 2**halvings)
-            moved = _system(graph, candidate)
-            if l2_cost(moved.b) < chi2:
-                poses, system = candidate, moved
-                break
-        if chi2 - l2_cost(system.b) <= _TOLERANCE * chi2:
+        moved = step_poses(graph, poses, _least_squares(system, system.b))
+        there = _system(graph, moved)
+        if l2_cost(there.b) > (1 - _TOLERANCE) * l2_cost(system.b):
             break
+        poses = moved
+        system = there
     return poses
 
 

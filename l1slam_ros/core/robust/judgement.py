@@ -30,6 +30,7 @@ from l1slam_ros.core.robust.forecast import (
     unsureness,
 )
 from l1slam_ros.core.robust.odometry.drift import straightened
+from l1slam_ros.core.robust.pairwise_consistency import RUN
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds.growth import Growth
 
@@ -51,8 +52,6 @@ NORM = 'another norm'
 FAILED = 'judging failed'
 UNSOLVED = 'solving failed'
 PARTS = 'parts'
-# Of fewer loops nothing is recorded.
-HANDFUL = 5
 
 
 @dataclass(frozen=True)
@@ -213,34 +212,43 @@ def listed(pairs: Indices) -> tuple[tuple[int, int], ...]:
     return tuple((i, j) for i, j in pairs.tolist())
 
 
-def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
-                 settled: bool = True) -> Judgement:
-    """Return what a state says of the factors that were given."""
-    square, suspect = fits(growth)
+def so_far(growth: Growth, drift: float = 0.0) -> Judgement:
+    """Return what a state believes, to fall back on; the loops that it left out are suspect."""
     given = growth.given
     size = given.size
     slip = growth.cut & ~given.gap
     accepted = (growth.accepted & ~slip)[:size]
-    sigmas = np.sqrt(square[:size])
+    return Judgement(accepted, given.is_loop[:size] & ~accepted, np.full(size, np.nan),
+                     growth.noise.variance.copy(), np.ones(size), np.flatnonzero(slip[:size]),
+                     drift=drift)
+
+
+def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), settled: bool = True,
+                 drift: float = 0.0) -> Judgement:
+    """Return what a state says of the factors that were given."""
+    believed = so_far(growth, drift)
+    square, suspect = fits(growth)
+    given = growth.given
+    size = given.size
     loops = given.is_loop[:size]
-    slips = np.flatnonzero(slip[:size])
     unsure = unsureness(growth)
     kinds = {doubt.kind for doubt in reasons}
     terms = terms_of(bool((given.is_loop & growth.accepted).any()), unsure,
                      *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
     confidence = forecast(terms) if loops.any() else float('nan')
-    left_out = np.flatnonzero(loops & ~accepted)
-    # Where all loops came in, what the file states may be vague; there is nothing to settle.
-    if (settled and len(left_out) and np.count_nonzero(loops) >= HANDFUL
+    left_out = np.flatnonzero(loops & ~believed.accepted)
+    # Where all loops came in, what the file states may be vague; there is nothing to settle. Of
+    # fewer loops than a run has nothing is recorded.
+    if (settled and len(left_out) and np.count_nonzero(loops) >= RUN
             and forecast(terms[:3]) < CONFIDENT):
         metres = unsure * right_within(growth.given.graph.manifold.positions(growth.poses))
         reasons += (doubt_of(given.factors.pairs[left_out], growth.given.graph.n_poses, WEAK,
                              f'{metres:.2g}'),)
     doubted = OTHER_MAP in kinds or bool(
-        2 * len(left_out) > np.count_nonzero(loops) >= HANDFUL)
-    return Judgement(accepted, suspect[:size], sigmas, growth.noise.variance,
-                     _noise(growth)[:size], slips, reasons, settled, confidence=confidence,
-                     terms=terms, is_refusal_doubted=doubted)
+        2 * len(left_out) > np.count_nonzero(loops) >= RUN)
+    return replace(believed, suspect=suspect[:size], sigmas=np.sqrt(square[:size]),
+                   noise=_noise(growth)[:size], doubts=reasons, settled=settled,
+                   confidence=confidence, terms=terms, is_refusal_doubted=doubted)
 
 
 def _noise(growth: Growth) -> Array:

@@ -25,19 +25,17 @@ from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.graph.spanning_tree import pair_key
-from l1slam_ros.core.robust.gating import DOUBT
+from l1slam_ros.core.robust.gating import DOUBT, PAIRED
 from l1slam_ros.core.robust.innovation import claimed_volume, log_claims, log_likelihood_ratio
+from l1slam_ros.core.robust.places import NEAR
 from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 
 # First ends, second ends and measurements of loops.
 Ends = tuple[Indices, Indices, Array]
-# So many loops are asked.
-ASKED = 250
 # Of each one so many pairs are looked at closely, those that differ least.
 _NEAREST = 20
-# A run has so many loops, each agrees with half as many others of it, and it is so long [m].
+# A run has so many loops, and each agrees with half as many others of it.
 RUN = 6
-_RUN_WAY = 2.5
 # One that is to outweigh the odometry has so many: of recorded ones five in six are true then.
 _LONG_RUN = 10
 
@@ -108,7 +106,8 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
         own = own[2 * count[own] >= RUN]
         ways = [np.ptp(poses[ends[rows[own]]], axis=0).max(initial=0.0)
                 for ends in (given.low, given.high)] if len(own) >= RUN else [0.0]
-        if min(ways) > _RUN_WAY:
+        # What both ways together go is more than what is near.
+        if min(ways) > NEAR / 2:
             order = np.argsort(-count[own], kind='stable')
             found.append(Group(rows[own[order]], np.array([number])))
     return found
@@ -153,9 +152,9 @@ def agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
 
 
 def asked(growth: Growth, rows: Indices) -> Indices:
-    """Return `ASKED` of some loops, as if at random, or all, (k,)."""
+    """Return `PAIRED` of some loops, as if at random, or all, (k,)."""
     order = np.argsort(keys(growth.given.low[rows], growth.given.high[rows]))
-    chosen: Indices = rows[order[:ASKED]]
+    chosen: Indices = rows[order[:PAIRED]]
     return chosen
 
 

@@ -19,19 +19,18 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.geometry.quantiles import gamma_quantile
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest_of_components
 from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.graph.spanning_tree import pair_key
+from l1slam_ros.core.robust.innovation import BY_CHANCE
 
 # Linked are loops whose ends lie within so many metres along the way, in sum, or within the length
 # of so many ordinary steps, where keyframes are far apart; and what they claim, too.
-_NEAR = 5.0
+NEAR = 5.0
 _NEAR_STEPS = 10
 # Claims are told apart to this part of it, so that a robot that stands has few different ones.
 _GRAIN = 0.1
-# [sigmas] One in ten thousand maps of loops that err each for itself is taken for one where they
-# share.
-_BEYOND_DOUBT = 3.719
 
 
 def err_together(place: Indices, residual: Array, drawn: Array) -> bool:
@@ -59,11 +58,9 @@ def err_together(place: Indices, residual: Array, drawn: Array) -> bool:
     larger = (found.sum() / (residual**2).sum()
               * (drawn**2).mean(axis=2).sum() / expected.sum())
     # A weighted sum of squares is nearly chi2 (F. E. Satterthwaite, An approximate distribution of
-    # estimates of variance components, 1946), the cube root of which is nearly normal (E. B.
-    # Wilson and M. M. Hilferty, The distribution of chi-square, 1931).
+    # estimates of variance components, 1946).
     freedom = expected.sum() ** 2 / (expected**2).sum()
-    spread = 2 / (9 * freedom)
-    return bool(np.cbrt(larger) > 1 - spread + _BEYOND_DOUBT * np.sqrt(spread))
+    return bool(larger * freedom > 2 * gamma_quantile(freedom / 2, 1 - BY_CHANCE))
 
 
 def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
@@ -81,7 +78,7 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     # The world is where the way begins, as WORLD finds it: last.
     way = np.concatenate(([0.0], np.cumsum(steps), [0.0]))
-    near = max(_NEAR, _NEAR_STEPS * float(np.median(steps)) if len(steps) else 0.0)
+    near = max(NEAR, _NEAR_STEPS * float(np.median(steps)) if len(steps) else 0.0)
     ends = np.stack((way[high] + way[low], way[high] - way[low]), axis=1) / near
     claimed = manifold.compose(with_world(manifold, chain)[low], Z)
     claim = manifold.positions(claimed) - positions[high]

@@ -26,7 +26,6 @@ from l1slam_ros.core.robust.forecast import drift_taken_for_noise
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
-    HANDFUL,
     ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
@@ -34,10 +33,10 @@ from l1slam_ros.core.robust.judgement import (
     UNFINISHED,
     Doubt,
     doubt_of,
-    listed,
 )
 from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
 from l1slam_ros.core.robust.pairwise_consistency import (
+    RUN,
     agree_at_a_place,
     longest_run,
     runs,
@@ -83,7 +82,7 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
     As one loop, by the median of what they say, it would not be believed by odometry alone.
     """
     given = growth.given
-    if (len(accepted) < HANDFUL or not given.may_err_as_one(accepted, TWO_PLACES)
+    if (len(accepted) < RUN or not given.may_err_as_one(accepted, TWO_PLACES)
             or (given.trusted | given.factors.is_absolute)[accepted].any()):
         return False
     odometry = growth.copy()
@@ -214,6 +213,5 @@ def _slip_doubt(growth: Growth, step: int) -> Doubt:
     given = growth.given
     span = given.spanning(step)
     used = growth.accepted & span
-    across = given.factors.pairs[used if used.any() else span]
-    return Doubt(SLIP, len(across), int(given.low[step]), int(given.high[step]),
-                 pairs=listed(across))
+    doubt = _doubt(growth, SLIP, np.flatnonzero(used if used.any() else span))
+    return replace(doubt, first=int(given.low[step]), last=int(given.high[step]))

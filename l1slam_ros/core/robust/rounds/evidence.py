@@ -22,12 +22,9 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph, turned
 from l1slam_ros.core.graph.parts import as_sure, bridged, vague_odometry
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.robust.innovation import stated_variance, student_quantile
+from l1slam_ros.core.robust.innovation import BY_CHANCE, stated_variance, student_quantile
 from l1slam_ros.core.robust.places import mates, places
 
-# At most one in so many true loops is refused for its noise alone. Of 89 runs half makes none
-# worse, double 1.
-REFUSED = 1e-3
 # A place may be one mistake, and two that agree hardly: they join parts, and what is as likely but
 # for two has a rival. The noise is learnt of loops of so many places at least, and a slip is
 # suspected: of fewer, errors may be one. A place that joins more than this part of the keyframes
@@ -82,7 +79,7 @@ class Evidence:
         span: Mask = self.is_loop & (self.low < self.high[step]) & (self.high > self.low[step])
         return span
 
-    def gate(self, freedom: Indices, refused: float = REFUSED) -> Array:
+    def gate(self, freedom: Indices, refused: float = BY_CHANCE) -> Array:
         """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
         return student_quantile(1 - refused, freedom, self.graph.manifold.TANGENT_SIZE)
 
