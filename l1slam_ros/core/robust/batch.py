@@ -78,6 +78,7 @@ from l1slam_ros.core.robust.judgement import (
 )
 from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, likeliest, straightened
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
+from l1slam_ros.core.robust.odometry.noisier import with_runs
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.evidence import REFUSED
@@ -147,32 +148,40 @@ class _Repair:
 
     def __call__(self, found: Growth, as_stated: Growth) -> Growth | None:
         """Return a state without a drift, asked once, or without a slip; None: there is none."""
-        straight = None if self._asked else self._straightened(as_stated)
+        straight = None if self._asked else self._straightened(found, as_stated)
         self._asked = True
         return straight or without_slip(found, as_stated)
 
-    def _straightened(self, as_stated: Growth) -> Growth | None:
+    def _straightened(self, found: Growth, as_stated: Growth) -> Growth | None:
         """Return the state without a drift that explains the loops, or was taken for noise."""
+        drifts = []
         if len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISY:
-            best, rival = likeliest([straight for drift in likely_drifts(self._graph).tolist()
-                                     for straight in self._without(drift)], as_stated)
-            if best:
-                self.drift = best.drift
-                self.rival = rival
-                return best.found
+            drifts = likely_drifts(self._graph).tolist()
         taken = drift_taken_for_noise(as_stated)
-        for straight in self._without(taken) if taken else ():
-            if straight.keeps_places(as_stated):
-                self.drift = taken
-                return straight.found
-        return None
+        others = [straight for drift in (drifts or [taken] if taken else drifts)
+                  for straight in self._without(drift)]
+        if not (as_stated.accepted & as_stated.given.is_loop).any():
+            others += self._without(0.0)
+        best, rival = likeliest([Straight(0.0, found, as_stated), *others])
+        if best.told is as_stated:
+            return None
+        self.drift = best.drift
+        self.rival = rival
+        return best.found
 
     def _without(self, drift: float) -> list[Straight]:
         """Return what odometry without a drift leads to, none, [], where that has no end."""
         growth = Growth(straightened(self._graph, drift), self._check)
         ends: list[Straight] = []
         growth.begin()
-        for _ in rounds(growth, lambda *states: ends.append(Straight(drift, *states))):
+
+        def ended(found: Growth, as_stated: Growth) -> Growth | None:
+            ends.append(Straight(drift, found, as_stated))
+            if (as_stated.accepted & as_stated.given.is_loop).any():
+                return None
+            return with_runs(found)
+
+        for _ in rounds(growth, ended):
             self._check()
         return ends
 

@@ -273,6 +273,14 @@ class BlockCholesky:
         layout = self._last
         kernels.prediction.solve_many(layout.panels, *layout.shape, self.pattern.position, right)
 
+    def log_det(self) -> float:
+        """Return the ln of the determinant of the matrix that was factored last."""
+        layout = self._last
+        *_, corner, stride = layout.places
+        own = np.arange(len(layout.size))
+        pivots = layout.panels[corner[:, None] + own * (stride[:, None] + 1)]
+        return 2 * float(np.log(pivots).sum())
+
     def covariances(self, at: Indices, parent: Indices, turn: Array, kept: Array,
                     begins: Indices) -> tuple[Array, Array]:
         """

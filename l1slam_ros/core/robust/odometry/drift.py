@@ -19,6 +19,7 @@ another one is nearly as likely, the map is doubtful.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -26,16 +27,12 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
-from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL, log_prior
-from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES, Evidence
+from l1slam_ros.core.robust.innovation import claimed_volume, factorised, log_claims
+from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL
+from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
-# A drift is believed of loops of so many places at least, if it is likelier by what these are
-# worth, or if no more than this part of them fits without it. Of 3 places one of 420 worlds has a
-# false drift, half (2) changed none of 89, double made 2 worse; without the part 5 of 40 are
-# worse, by half or double of it none of 89.
-_DRIFT_PLACES = 4
-_FEW = 0.1
 # Odometry whose variance is so many times what it states may drift; by half or double none of 89
 # runs is another.
 NOISY = 4.0
@@ -81,80 +78,64 @@ class Straight:
     found: Growth
     told: Growth
 
-    def log_odds(self, other: 'Straight') -> float:
-        """Return the ln of its odds against another drift, by what they lead to."""
-        usual = log_prior(self.drift, USUAL**2) - log_prior(other.drift, USUAL**2)
-        return float(usual) + _log_odds(self.told, other.told)
+    @cached_property
+    def log_evidence(self) -> float:
+        """
+        Return the ln of how likely its loops are, see `log_evidence`, if the odometry drifts so.
 
-    def keeps_places(self, as_stated: Growth) -> bool:
-        """Return whether loops of as many places are accepted as without."""
-        return _places(as_stated, self.told) >= _places(as_stated, as_stated)
+        A drift is normal about none, and the map tells it to within a variance: of the density of
+        both together the integral (P.-S. Laplace) is left.
+        """
+        square = USUAL**2 * drift_information(self.told) if self.drift else 0.0
+        return log_evidence(self.told) - ((self.drift / USUAL)**2 + float(np.log1p(square))) / 2
 
 
-def likeliest(some: list[Straight], as_stated: Growth) -> tuple[Straight | None, float]:
+def likeliest(some: list[Straight]) -> tuple[Straight, float]:
+    """Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0."""
+    best = max(some, key=lambda straight: straight.log_evidence)
+    less, more = min(((best.log_evidence - other.log_evidence, other.drift - best.drift)
+                      for other in some if other.drift != best.drift), default=(np.inf, 0.0))
+    return best, more if less < TWO_PLACES * best.told.given.log_odds_of_place else 0.0
+
+
+def log_evidence(growth: Growth) -> float:
     """
-    Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0.
+    Return ln p(loops if they are true | odometry) / p(loops if they are lies), of those accepted.
 
-    None where it does not explain the loops.
+    With the Jacobian J and the residuals r of what is accepted, whitened by roots of information
+    U, H = J'J, and V what a lie could claim on this map: the loops would fit a small map by
+    chance, too.
+
+        sum over the loops (ln V + ln det U - k/2 ln 2 pi) - (r'r + ln det H - ln det H_odometry) / 2
     """
-    best = None
-    for straight in some:
-        if not best or straight.log_odds(best) > 0:
-            best = straight
-    if not best or not _explains(best, as_stated):
-        return None, 0.0
-    odds, more = min(((best.log_odds(other), other.drift - best.drift)
-                      for other in some if other is not best), default=(np.inf, 0.0))
-    return best, more if odds < TWO_PLACES * as_stated.given.log_odds_of_place else 0.0
+    rows = np.flatnonzero(growth.accepted)
+    loops = growth.given.is_loop[rows]
+    graph = growth.subgraph(rows)
+    cholesky = cholesky_of(graph)
+    factorised(graph, growth.poses, cholesky)
+    free = np.zeros(graph.manifold.TANGENT_SIZE)
+    claims = np.where(loops, log_claims(graph.between, claimed_volume(graph.manifold, growth.poses)),
+                      log_claims(graph.between, free))
+    numbers = graph.between.freedom[loops].sum()
+    square = float((growth.posterior.residual**2).sum())
+    return float(claims.sum() - (numbers * np.log(2 * np.pi) + square + cholesky.log_det()) / 2)
 
 
-def _log_odds(one: Growth, other: Growth) -> float:
-    """
-    Return the ln of the odds of one map against another, of odometry with and without a drift.
-
-    Of each place that only one of them accepts, half a gate. The variances q of odometry and of
-    loops were found, so what loops measure has a density proportional to det C(q)^-1/2, and the
-    derivative of ln det C by ln q are the degrees of freedom f that the map leaves of the kind:
-    1/2 sum f ln(q of the other / q).
-    """
-    freedom = sum(np.bincount(state.given.is_loop[state.accepted], np.trace(
-        state.posterior.moment, axis1=1, axis2=2), 2) for state in (one, other)) / 2
-    calmer = np.log(other.noise.variance / one.noise.variance)
-    more = _places(one, one) - _places(one, other)
-    return float(freedom @ calmer / 2 + more * one.given.log_odds_of_place)
+def drift_information(growth: Growth) -> float:
+    """Return what a map says of the drift of its odometry, as the inverse of a variance."""
+    rows, turn = _turns(growth)
+    by_noise = np.einsum('mi,miq->q', turn, growth.posterior.left_over(rows))
+    return float((by_noise**2).mean())
 
 
-def _explains(straight: Straight, as_stated: Growth) -> bool:
-    """
-    Return whether loops need the odometry to be rid of a drift.
-
-    That is, hardly any fit without, or its odds are those of several places and the odometry is
-    no noisier, as it would be if lies came in by chance. A drift by which no place is won and
-    which is within what the odometry states is left, whether lies make it be asked for or not.
-    And the loops are of several places: a lap that closes at one place closes as well if it has a
-    turn more.
-    """
-    told = straight.told
-    loops, before = (np.flatnonzero(state.accepted & state.given.is_loop)
-                     for state in (told, as_stated))
-    if told.given.may_err_as_one(loops, _DRIFT_PLACES):
-        return False
-    noise = as_stated.noise.variance[0]
-    calmer = told.noise.variance[0] <= noise
-    needed = (noise > NOISY or _places(told, told) > _places(told, as_stated)
-              or not _is_stated(straight.drift, as_stated.given))
-    enough = _DRIFT_PLACES * told.given.log_odds_of_place
-    return (len(before) <= _FEW * len(loops)
-            or bool(needed and calmer and _log_odds(told, as_stated) >= enough))
+def drift_left(growth: Growth) -> float:
+    """Return what the residuals say of the drift that is left in a map, times its information."""
+    rows, turn = _turns(growth)
+    return float((turn * growth.posterior.residual[rows]).sum())
 
 
-def _is_stated(drift: float, given: Evidence) -> bool:
-    """Return whether a drift is within what the odometry states, as a loop is within its gate."""
-    factors = given.factors
-    turn = drift * drift_turn(factors, np.flatnonzero(factors.is_odometry))
-    return bool((turn**2).sum() < given.gate(np.array([1]))[0])
-
-
-def _places(known: Growth, growth: Growth) -> int:
-    """Return of how many places, as one state knows them, the loops are that another accepts."""
-    return len(np.unique(known.given.place[growth.accepted & growth.given.is_loop]))
+def _turns(growth: Growth) -> tuple[Indices, Array]:
+    """Return the odometry among what is accepted, (k,), and its `drift_turn`, as it is weighed."""
+    rows = np.flatnonzero(growth.accepted)
+    at = np.flatnonzero(~(growth.given.is_loop | growth.cut)[rows])
+    return at, drift_turn(growth.given.factors, rows[at]) / np.sqrt(growth.noise.assumed[0])
