@@ -32,6 +32,7 @@ from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL
 from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import l2_map
 
 # Odometry whose variance is so many times what it states may drift; by half or double none of 89
 # runs is another.
@@ -79,46 +80,63 @@ class Straight:
     told: Growth
 
     @cached_property
+    def log_room(self) -> float:
+        """The ln of the volume that a lie could claim on this map, in its units."""
+        return float(claimed_volume(se2, self.told.poses).sum())
+
+    @cached_property
     def log_evidence(self) -> float:
         """
-        Return the ln of how likely its loops are, see `log_evidence`, if the odometry drifts so.
+        Return ln p(loops if they are true | odometry) / p(loops if they are lies), one a place.
 
-        A drift is normal about none, and the map tells it to within a variance: of the density of
-        both together the integral (P.-S. Laplace) is left.
+        Of those that are accepted. With the Jacobian J and the residuals r of these and of the
+        odometry, whitened by roots of information U, H = J'J, and V of `log_room`:
+
+            sum over loops (ln V + ln det U - k/2 ln 2 pi) - (r'r + ln det H - ln det H_odometry)/2
+
+        A drift d is normal about none, and the map tells it as well as S, the inverse of a
+        variance: of the density of both the integral is left (P.-S. Laplace).
         """
-        square = USUAL**2 * drift_information(self.told) if self.drift else 0.0
-        return log_evidence(self.told) - ((self.drift / USUAL)**2 + float(np.log1p(square))) / 2
+        growth = self.told
+        loops = np.flatnonzero(growth.accepted & growth.given.is_loop)
+        one_each = loops[np.unique(growth.given.place[loops], return_index=True)[1]]
+        graph = growth.subgraph(np.union1d(
+            np.flatnonzero(growth.accepted & ~growth.given.is_loop), one_each))
+        cholesky = cholesky_of(graph)
+        system = factorised(graph, l2_map(graph, growth.poses, cholesky), cholesky)
+        roots = log_claims(graph.between, np.zeros(graph.manifold.TANGENT_SIZE)).sum()
+        numbers = growth.given.factors.freedom[one_each].sum()
+        square = float(system.b @ system.b) + numbers * np.log(2 * np.pi) + cholesky.log_det()
+        if self.drift:
+            square += (self.drift / USUAL)**2 + np.log1p(USUAL**2 * drift_information(growth))
+        return float(roots + len(one_each) * self.log_room - square / 2)
+
+    @cached_property
+    def others_of_places(self) -> int:
+        """How many loops are accepted beside one a place."""
+        loops = self.told.accepted & self.told.given.is_loop
+        return int(np.count_nonzero(loops)) - _places(self.told)
 
 
 def likeliest(some: list[Straight]) -> tuple[Straight, float]:
-    """Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0."""
-    best = max(some, key=lambda straight: straight.log_evidence)
-    less, more = min(((best.log_evidence - other.log_evidence, other.drift - best.drift)
+    """
+    Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0.
+
+    The other loops of a place tell how large the map is: on a smaller one there would be more
+    such places than loops were found at.
+    """
+    widest = max(straight.log_room for straight in some)
+    value = {id(straight): straight.log_evidence
+             + straight.others_of_places * (straight.log_room - widest) for straight in some}
+    best = max(some, key=lambda straight: value[id(straight)])
+    less, more = min(((value[id(best)] - value[id(other)], other.drift - best.drift)
                       for other in some if other.drift != best.drift), default=(np.inf, 0.0))
     return best, more if less < TWO_PLACES * best.told.given.log_odds_of_place else 0.0
 
 
-def log_evidence(growth: Growth) -> float:
-    """
-    Return ln p(loops if they are true | odometry) / p(loops if they are lies), of those accepted.
-
-    With the Jacobian J and the residuals r of what is accepted, whitened by roots of information
-    U, H = J'J, and V what a lie could claim on this map: the loops would fit a small map by
-    chance, too.
-
-        sum over the loops (ln V + ln det U - k/2 ln 2 pi) - (r'r + ln det H - ln det H_odometry) / 2
-    """
-    rows = np.flatnonzero(growth.accepted)
-    loops = growth.given.is_loop[rows]
-    graph = growth.subgraph(rows)
-    cholesky = cholesky_of(graph)
-    factorised(graph, growth.poses, cholesky)
-    free = np.zeros(graph.manifold.TANGENT_SIZE)
-    claims = np.where(loops, log_claims(graph.between, claimed_volume(graph.manifold, growth.poses)),
-                      log_claims(graph.between, free))
-    numbers = graph.between.freedom[loops].sum()
-    square = float((growth.posterior.residual**2).sum())
-    return float(claims.sum() - (numbers * np.log(2 * np.pi) + square + cholesky.log_det()) / 2)
+def _places(growth: Growth) -> int:
+    """Return of how many places loops are accepted."""
+    return len(np.unique(growth.given.place[growth.accepted & growth.given.is_loop]))
 
 
 def drift_information(growth: Growth) -> float:
