@@ -162,6 +162,9 @@ class _Repair:
                   for straight in self._without(drift)]
         if not (as_stated.accepted & as_stated.given.is_loop).any():
             others += self._without(0.0)
+        else:  # lies that come in by chance make it noisier
+            others = [other for other in others
+                      if other.told.noise.variance[0] <= as_stated.noise.variance[0]]
         best, rival = likeliest([Straight(0.0, found, as_stated), *others])
         if best.told is as_stated:
             return None

@@ -89,54 +89,82 @@ class Straight:
         """
         Return ln p(loops if they are true | odometry) / p(loops if they are lies), one a place.
 
-        Of those that are accepted. With the Jacobian J and the residuals r of these and of the
-        odometry, whitened by roots of information U, H = J'J, and V of `log_room`:
-
-            sum over loops (ln V + ln det U - k/2 ln 2 pi) - (r'r + ln det H - ln det H_odometry)/2
-
         A drift d is normal about none, and the map tells it as well as S, the inverse of a
         variance: of the density of both the integral is left (P.-S. Laplace).
         """
         growth = self.told
-        loops = np.flatnonzero(growth.accepted & growth.given.is_loop)
-        one_each = loops[np.unique(growth.given.place[loops], return_index=True)[1]]
-        graph = growth.subgraph(np.union1d(
-            np.flatnonzero(growth.accepted & ~growth.given.is_loop), one_each))
-        cholesky = cholesky_of(graph)
-        system = factorised(graph, l2_map(graph, growth.poses, cholesky), cholesky)
-        roots = log_claims(graph.between, np.zeros(graph.manifold.TANGENT_SIZE)).sum()
-        numbers = growth.given.factors.freedom[one_each].sum()
-        square = float(system.b @ system.b) + numbers * np.log(2 * np.pi) + cholesky.log_det()
+        evidence = len(self._one_each) * self.log_room + _log_likelihood(growth, self._one_each)
         if self.drift:
-            square += (self.drift / USUAL)**2 + np.log1p(USUAL**2 * drift_information(growth))
-        return float(roots + len(one_each) * self.log_room - square / 2)
+            known = np.log1p(USUAL**2 * drift_information(growth))
+            evidence -= float((self.drift / USUAL)**2 + known) / 2
+        return evidence
 
     @cached_property
-    def others_of_places(self) -> int:
-        """How many loops are accepted beside one a place."""
-        loops = self.told.accepted & self.told.given.is_loop
-        return int(np.count_nonzero(loops)) - _places(self.told)
+    def of_others(self) -> float:
+        """How likely the other loops of these places are, ln of a density."""
+        return _log_likelihood(self.told, self._loops) - _log_likelihood(
+            self.told, self._one_each)
+
+    @property
+    def others(self) -> int:
+        """How many these are."""
+        return len(self._loops) - len(self._one_each)
+
+    @cached_property
+    def stretches(self) -> float:
+        """Along how many stretches more than places loops are."""
+        one, other = self.told.given.mates
+        loops = np.zeros(len(self.told.accepted), bool)
+        loops[self._loops] = True
+        near = np.bincount(one, loops[other], len(loops))[self._loops]
+        return float((1 / (1 + near)).sum()) - len(self._one_each)
+
+    @cached_property
+    def _loops(self) -> Indices:
+        return np.asarray(np.flatnonzero(self.told.accepted & self.told.given.is_loop))
+
+    @cached_property
+    def _one_each(self) -> Indices:
+        place = self.told.given.place[self._loops]
+        return np.asarray(self._loops[np.unique(place, return_index=True)[1]])
 
 
 def likeliest(some: list[Straight]) -> tuple[Straight, float]:
     """
     Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0.
 
-    The other loops of a place tell how large the map is: on a smaller one there would be more
-    such places than loops were found at.
+    The other loops of a place agree, whether it is a mistake or not: they tell no more than how
+    well they do. And the longer a place is, the larger the map: on a smaller one there would be
+    more such places than loops were found at.
     """
     widest = max(straight.log_room for straight in some)
-    value = {id(straight): straight.log_evidence
-             + straight.others_of_places * (straight.log_room - widest) for straight in some}
-    best = max(some, key=lambda straight: value[id(straight)])
-    less, more = min(((value[id(best)] - value[id(other)], other.drift - best.drift)
-                      for other in some if other.drift != best.drift), default=(np.inf, 0.0))
+    best_fit = max((straight.of_others / straight.others for straight in some if straight.others),
+                   default=0.0)
+    values = np.array([
+        straight.log_evidence + straight.of_others - straight.others * best_fit
+        + straight.stretches * (straight.log_room - widest) for straight in some])
+    best = some[int(np.argmax(values))]
+    less, more = min(((values.max() - value, other.drift - best.drift)
+                      for other, value in zip(some, values, strict=True)
+                      if other.drift != best.drift), default=(np.inf, 0.0))
     return best, more if less < TWO_PLACES * best.told.given.log_odds_of_place else 0.0
 
 
-def _places(growth: Growth) -> int:
-    """Return of how many places loops are accepted."""
-    return len(np.unique(growth.given.place[growth.accepted & growth.given.is_loop]))
+def _log_likelihood(growth: Growth, loops: Indices) -> float:
+    """
+    Return the ln of how likely some loops, (k,), are if they are true, by the odometry.
+
+    With the Jacobian J and the residuals r of both, whitened by roots of information U, H = J'J:
+
+        sum over loops (ln det U - 3/2 ln 2 pi) - (r'r + ln det H - ln det H_odometry) / 2
+    """
+    graph = growth.subgraph(np.union1d(
+        np.flatnonzero(growth.accepted & ~growth.given.is_loop), loops))
+    cholesky = cholesky_of(graph)
+    system = factorised(graph, l2_map(graph, growth.poses, cholesky), cholesky)
+    numbers = growth.given.factors.freedom[loops].sum()
+    square = float(system.b @ system.b) + numbers * np.log(2 * np.pi) + cholesky.log_det()
+    return float(log_claims(graph.between, np.zeros(3)).sum() - square / 2)
 
 
 def drift_information(growth: Growth) -> float:
