@@ -157,20 +157,21 @@ class _Repair:
         drifts = []
         if len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISY:
             drifts = likely_drifts(self._graph).tolist()
+        stated = Straight(0.0, found, as_stated)
+        if not stated.explains_any:
+            drifts.append(0.0)
+        best, rival = likeliest([stated, *(straight for drift in drifts
+                                           for straight in self._without(drift))])
+        if best is not stated:
+            self.drift = best.drift
+            self.rival = rival
+            return best.found
         taken = drift_taken_for_noise(as_stated)
-        others = [straight for drift in (drifts or [taken] if taken else drifts)
-                  for straight in self._without(drift)]
-        if not (as_stated.accepted & as_stated.given.is_loop).any():
-            others += self._without(0.0)
-        else:  # lies that come in by chance make it noisier
-            others = [other for other in others
-                      if other.told.noise.variance[0] <= as_stated.noise.variance[0]]
-        best, rival = likeliest([Straight(0.0, found, as_stated), *others])
-        if best.told is as_stated:
-            return None
-        self.drift = best.drift
-        self.rival = rival
-        return best.found
+        for straight in self._without(taken) if taken else ():
+            if straight.keeps_places(as_stated):
+                self.drift = taken
+                return straight.found
+        return None
 
     def _without(self, drift: float) -> list[Straight]:
         """Return what odometry without a drift leads to, none, [], where that has no end."""
@@ -180,9 +181,7 @@ class _Repair:
 
         def ended(found: Growth, as_stated: Growth) -> Growth | None:
             ends.append(Straight(drift, found, as_stated))
-            if (as_stated.accepted & as_stated.given.is_loop).any():
-                return None
-            return with_runs(found)
+            return None if ends[-1].explains_any else with_runs(found)
 
         for _ in rounds(growth, ended):
             self._check()
