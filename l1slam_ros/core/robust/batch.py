@@ -158,7 +158,7 @@ class _Repair:
         if len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISY:
             drifts = likely_drifts(self._graph).tolist()
         stated = Straight(0.0, found, as_stated)
-        if not stated.explains_any:
+        if not len(stated.loops):
             drifts.append(0.0)
         best, rival = likeliest([stated, *(straight for drift in drifts
                                            for straight in self._without(drift))])
@@ -181,7 +181,7 @@ class _Repair:
 
         def ended(found: Growth, as_stated: Growth) -> Growth | None:
             ends.append(Straight(drift, found, as_stated))
-            return None if ends[-1].explains_any else with_runs(found)
+            return None if len(ends[-1].loops) else with_runs(found)
 
         for _ in rounds(growth, ended):
             self._check()

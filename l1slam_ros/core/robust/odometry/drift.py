@@ -82,11 +82,6 @@ class Straight:
     found: Growth
     told: Growth
 
-    @property
-    def explains_any(self) -> bool:
-        """Whether any loop is accepted."""
-        return bool(len(self._loops))
-
     @cached_property
     def log_room(self) -> float:
         """The ln of the volume that a lie could claim on this map, in its units."""
@@ -102,13 +97,20 @@ class Straight:
         density of both the integral is left (P.-S. Laplace).
         """
         growth = self.told
-        loops = self._loops
-        _, one_each, count = np.unique(growth.given.place[loops], return_index=True,
-                                       return_counts=True)
-        alone = np.count_nonzero(count == 1) * np.log(np.count_nonzero(growth.given.is_loop))
+        alone = np.count_nonzero(np.bincount(growth.given.place[self.loops]) == 1)
         known = np.log1p(USUAL**2 * drift_information(growth)) if self.drift else 0.0
-        return float(_log_likelihood(growth, loops[one_each]) + len(count) * self.log_room - alone
-                     - ((self.drift / USUAL)**2 + known) / 2)
+        return float(
+            _log_likelihood(growth, self._one_each) + len(self._one_each) * self.log_room
+            - alone * np.log(len(growth.given.factors)) - ((self.drift / USUAL)**2 + known) / 2)
+
+    def fits(self, loops: Indices) -> tuple[float, int]:
+        """Return the ln of how likely the others of its places are among some, and their count."""
+        others = np.setdiff1d(np.intersect1d(loops, self.loops), self._one_each)
+        if not len(others):
+            return 0.0, 0
+        both = np.union1d(others, self._one_each)
+        return (_log_likelihood(self.told, both) - _log_likelihood(self.told, self._one_each),
+                len(others))
 
     @cached_property
     def stretches(self) -> float:
@@ -116,16 +118,22 @@ class Straight:
         given = self.told.given
         one, other = given.mates
         loops = np.zeros(len(given.factors), bool)
-        loops[self._loops] = True
-        near = np.bincount(one, loops[other], len(loops))[self._loops]
-        return float((1 / (1 + near)).sum()) - len(np.unique(given.place[self._loops]))
+        loops[self.loops] = True
+        near = np.bincount(one, loops[other], len(loops))[self.loops]
+        return float((1 / (1 + near)).sum()) - len(self._one_each)
 
     def keeps_places(self, as_stated: Growth) -> bool:
         """Return whether loops of as many places are accepted as without."""
         return _places(as_stated, self.told) >= _places(as_stated, as_stated)
 
     @cached_property
-    def _loops(self) -> Indices:
+    def _one_each(self) -> Indices:
+        place = self.told.given.place[self.loops]
+        return np.asarray(self.loops[np.unique(place, return_index=True)[1]])
+
+    @cached_property
+    def loops(self) -> Indices:
+        """The loops that are accepted, (k,)."""
         return np.asarray(np.flatnonzero(self.told.accepted & self.told.given.is_loop))
 
 
@@ -137,14 +145,18 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float]:
     by what several places are worth, and to leave the odometry no noisier, as it would be if lies
     came in by chance.
 
-    The other loops of a place agree, be it a mistake or not. But the longer a place is, the larger
-    is the map: on a smaller one there would be more such places than loops were found at.
+    The other loops of a place agree, be it a mistake or not: they tell how noisy those are that
+    fit without. But the longer a place is, the larger is the map: on a smaller one there would be
+    more such places than loops were found at.
     """
     widest = max(straight.log_room for straight in some)
     values = np.array([straight.log_evidence + straight.stretches * (straight.log_room - widest)
                        for straight in some])
     worth = some[0].told.given.log_odds_of_place
-    if some[0].explains_any:
+    known = some[0].loops
+    if len(known):
+        fits, count = np.array([straight.fits(known) for straight in some]).T
+        values += fits - count * fits[0] / max(count[0], 1)
         values[0] += _DRIFT_PLACES * worth
         noise = np.array([straight.told.noise.variance[0] for straight in some])
         values[noise > noise[0]] = -np.inf
