@@ -18,7 +18,7 @@ more, so a map is made by each: the one that wins most places with the least noi
 another one is nearly as likely, the map is doubtful.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -104,12 +104,18 @@ class Straight:
             - alone * np.log(len(growth.given.factors)) - ((self.drift / USUAL)**2 + known) / 2)
 
     def fits(self, loops: Indices) -> tuple[float, int]:
-        """Return the ln of how likely the others of its places are among some, and their count."""
+        """
+        Return the ln of how likely the others of its places are among some, and their count.
+
+        By the noise as it was found.
+        """
         others = np.setdiff1d(np.intersect1d(loops, self.loops), self._one_each)
         if not len(others):
             return 0.0, 0
+        growth = self.told.copy()
+        growth.noise = replace(growth.noise, at_their_word=False)
         both = np.union1d(others, self._one_each)
-        return (_log_likelihood(self.told, both) - _log_likelihood(self.told, self._one_each),
+        return (_log_likelihood(growth, both) - _log_likelihood(growth, self._one_each),
                 len(others))
 
     @cached_property
@@ -153,10 +159,11 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float]:
     values = np.array([straight.log_evidence + straight.stretches * (straight.log_room - widest)
                        for straight in some])
     worth = some[0].told.given.log_odds_of_place
-    known = some[0].loops
-    if len(known):
-        fits, count = np.array([straight.fits(known) for straight in some]).T
-        values += fits - count * fits[0] / max(count[0], 1)
+    stated = len(some[0].loops) > 0
+    first = 0 if stated else int(np.argmax(values))
+    fits, count = np.array([straight.fits(some[first].loops) for straight in some]).T
+    values += fits - count * fits[first] / max(count[first], 1)
+    if stated:
         values[0] += _DRIFT_PLACES * worth
         noise = np.array([straight.told.noise.variance[0] for straight in some])
         values[noise > noise[0]] = -np.inf
