@@ -34,9 +34,6 @@ from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 
-# What a drift has to be worth if loops fit without it, in places: of 3 one of 420 worlds has a false
-# drift, half (2) changed none of 89, double made 2 worse.
-_DRIFT_PLACES = 4
 # Odometry whose variance is so many times what it states may drift; by half or double none of 89
 # runs is another.
 NOISY = 4.0
@@ -103,17 +100,17 @@ class Straight:
             _log_likelihood(growth, self._one_each) + len(self._one_each) * self.log_room
             - alone * np.log(len(growth.given.factors)) - ((self.drift / USUAL)**2 + known) / 2)
 
-    def fits(self, loops: Indices) -> tuple[float, int]:
+    def fits(self, loops: Indices, as_found: bool) -> tuple[float, int]:
         """
         Return the ln of how likely the others of its places are among some, and their count.
 
-        By the noise as it was found.
+        as_found : by the noise as it was found
         """
         others = np.setdiff1d(np.intersect1d(loops, self.loops), self._one_each)
         if not len(others):
             return 0.0, 0
         growth = self.told.copy()
-        growth.noise = replace(growth.noise, at_their_word=False)
+        growth.noise = replace(growth.noise, at_their_word=not as_found)
         both = np.union1d(others, self._one_each)
         return (_log_likelihood(growth, both) - _log_likelihood(growth, self._one_each),
                 len(others))
@@ -148,7 +145,7 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float]:
     Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0.
 
     The first one is that without a drift. Where it explains loops, too, another has to be likelier
-    by what several places are worth, and to leave the odometry no noisier, as it would be if lies
+    by what two places are worth, and to leave the odometry no noisier, as it would be if lies
     came in by chance.
 
     The other loops of a place agree, be it a mistake or not: they tell how noisy those are that
@@ -158,20 +155,20 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float]:
     widest = max(straight.log_room for straight in some)
     values = np.array([straight.log_evidence + straight.stretches * (straight.log_room - widest)
                        for straight in some])
-    worth = some[0].told.given.log_odds_of_place
+    sure = TWO_PLACES * some[0].told.given.log_odds_of_place
     stated = len(some[0].loops) > 0
     first = 0 if stated else int(np.argmax(values))
-    fits, count = np.array([straight.fits(some[first].loops) for straight in some]).T
+    fits, count = np.array([straight.fits(some[first].loops, stated) for straight in some]).T
     values += fits - count * fits[first] / max(count[first], 1)
     if stated:
-        values[0] += _DRIFT_PLACES * worth
+        values[0] += sure
         noise = np.array([straight.told.noise.variance[0] for straight in some])
         values[noise > noise[0]] = -np.inf
     best = some[int(np.argmax(values))]
     less, more = min(((values.max() - value, other.drift - best.drift)
-                      for other, value in zip(some, values, strict=True)
+                      for other, value in zip(some[1:], values[1:], strict=True)
                       if other.drift != best.drift), default=(np.inf, 0.0))
-    return best, more if less < TWO_PLACES * worth else 0.0
+    return best, more if less < sure else 0.0
 
 
 def _places(known: Growth, growth: Growth) -> int:
