@@ -159,14 +159,15 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float]:
     stated = len(some[0].loops) > 0
     first = 0 if stated else int(np.argmax(values))
     fits, count = np.array([straight.fits(some[first].loops, stated) for straight in some]).T
-    values += fits - count * fits[first] / max(count[first], 1)
+    fitting = values + fits - count * fits[first] / max(count[first], 1)
     if stated:
-        values[0] += sure
         noise = np.array([straight.told.noise.variance[0] for straight in some])
-        values[noise > noise[0]] = -np.inf
-    best = some[int(np.argmax(values))]
-    less, more = min(((values.max() - value, other.drift - best.drift)
-                      for other, value in zip(some[1:], values[1:], strict=True)
+        fitting[noise > noise[0]] = -np.inf
+        fitting[0] += sure
+        first = int(np.argmax(fitting))
+    best = some[first]
+    less, more = min(((fitting[first] - value, other.drift - best.drift)
+                      for other, value in zip(some[1:], fitting[1:], strict=True)
                       if other.drift != best.drift), default=(np.inf, 0.0))
     return best, more if less < sure else 0.0
 

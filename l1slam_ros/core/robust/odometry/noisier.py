@@ -52,7 +52,7 @@ def with_runs(growth: Growth) -> Growth | None:
     state.noise = replace(noise, variance=noisier.noise.variance)
     state.drops[:] = 0
     # Once from noise that is far too large, and once from what was left of that.
-    for _ in range(2):
+    for _ in range(2 if loops.any() else 8):
         state.noise = state.noise.forgotten()
         state.solve()
     state.accept_more()
