@@ -14,8 +14,8 @@ the odometry without it, and which drift is to be believed. Wheels of unequal si
 with an offset, do that.
 
 `drift_likelihood` proposes drifts. Of laps that close also those by which each has a full turn
-more, so a map is made by each: the one that wins most places with the least noise is taken. Where
-another one is nearly as likely, the map is doubtful.
+more, so a map is made by each: the one by which the loops are likeliest is taken. Where another
+one is nearly as likely, the map is doubtful.
 """
 
 from dataclasses import dataclass, replace
@@ -169,7 +169,7 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float]:
     less, more = min(((fitting[first] - value, other.drift - best.drift)
                       for other, value in zip(some[1:], fitting[1:], strict=True)
                       if other.drift != best.drift), default=(np.inf, 0.0))
-    return best, more if less < sure else 0.0
+    return best, more if less < sure and best is not some[0] else 0.0
 
 
 def _places(known: Growth, growth: Growth) -> int:
