@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""A lap that closes where it began: all true loops are of one place, and turns more fit as well."""
+"""A lap that closes where it began: all true loops are of one place, and turns more fit, too."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ SIGMAS = np.array([[0.05, 0.05, 0.003], [0.1, 0.1, 0.02]])
 
 
 def ring(n, loops, seed, noisier=1.0):
-    """Return a lap that is not quite round, and its truth; noisier : times what odometry states."""
+    """Return a lap that is not quite round, and its truth; odometry is so much noisier."""
     rng = np.random.default_rng(seed)
     angle = 2 * np.pi * np.arange(n + loops) / n
     radius = n / 6.3 * (1 + rng.uniform(0, 0.3) * np.sin(rng.integers(2, 6) * angle))
