@@ -40,9 +40,8 @@ A slip
     fit, lies are the other: `slips` compares their odds, with half a gate for each place that one
     of them calls a lie.
 A drift
-    is an error of all steps, the same on each metre. Where loops are left out, or the odometry is
-    far noisier than it says, it is a third explanation, asked before slips: odometry rid of it has
-    to win places or be less noisy (`drift`). Of one learnt as noise the residuals tell.
+    is an error of all steps, the same on each metre: a third explanation, asked before slips. It
+    is taken where it makes the loops likelier (`drift`); of one learnt as noise residuals tell.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
@@ -84,6 +83,7 @@ from l1slam_ros.core.robust.judgement import (
 )
 from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, likeliest, straightened
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
+from l1slam_ros.core.robust.odometry.noisier import with_runs
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.growth import Growth
@@ -138,11 +138,7 @@ def robust_solve(
 
 
 class _Repair:
-    """
-    What loops that are left out may be right by.
-
-    drift : that of the odometry [rad/m]; rival : by how much more it may be.
-    """
+    """What loops left out may be right by: drift [rad/m]; rival: by how much more it may be."""
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None]):
         self._graph = graph
@@ -152,32 +148,36 @@ class _Repair:
 
     def __call__(self, found: Growth, as_stated: Growth) -> Growth | None:
         """Return a state without a drift, asked once, or without a slip; None: there is none."""
-        straight = None if self._asked else self._straightened(as_stated)
+        straight = None if self._asked else self._straightened(found, as_stated)
         self._asked = True
         return straight or without_slip(found, as_stated)
 
-    def _straightened(self, as_stated: Growth) -> Growth | None:
+    def _straightened(self, found: Growth, as_stated: Growth) -> Growth | None:
         """Return the state without a drift that explains the loops, or was taken for noise."""
-        if len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISY:
-            best, rival = likeliest([straight for drift in likely_drifts(self._graph).tolist()
-                                     for straight in self._without(drift)], as_stated)
-            if best:
-                self.drift = best.drift
-                self.rival = rival
-                return best.found
-        taken = drift_taken_for_noise(as_stated)
-        for straight in self._without(taken) if taken else ():
-            if straight.keeps_places(as_stated):
-                self.drift = taken
-                return straight.found
-        return None
+        best = stated = Straight(0.0, found, as_stated)
+        asked = len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISY
+        drifts = likely_drifts(self._graph).tolist() if asked else []
+        if drifts:
+            others = drifts if len(stated.loops) else [*drifts, 0.0]
+            best, self.rival = likeliest([stated, *(straight for drift in others
+                                                    for straight in self._without(drift))])
+        taken = drift_taken_for_noise(as_stated) if best is stated else 0.0
+        best = next((straight for straight in (self._without(taken) if taken else ())
+                     if straight.keeps_places(as_stated)), best)
+        self.drift = best.drift
+        return None if best is stated else best.found
 
     def _without(self, drift: float) -> list[Straight]:
         """Return what odometry without a drift leads to, none, [], where that has no end."""
         growth = Growth(straightened(self._graph, drift), self._check)
         ends: list[Straight] = []
+
+        def ended(*states: Growth) -> Growth | None:
+            ends.append(Straight(drift, *states))
+            return None if len(ends[-1].loops) else with_runs(states[0])
+
         growth.begin()
-        for _ in rounds(growth, lambda *states: ends.append(Straight(drift, *states))):
+        for _ in rounds(growth, ended):
             self._check()
         return ends
 

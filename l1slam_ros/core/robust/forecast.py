@@ -20,7 +20,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.robust.innovation import spread_of
-from l1slam_ros.core.robust.odometry.drift import drift_turn
+from l1slam_ros.core.robust.odometry.drift import drift_information, drift_left
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
@@ -103,12 +103,7 @@ def left_drift(growth: Growth) -> tuple[float, float]:
     """
     if growth.given.graph.manifold is not se2:
         return 0.0, 0.0
-    rows = np.flatnonzero(growth.accepted)
-    at = np.flatnonzero(~(growth.given.is_loop | growth.cut)[rows])
-    turn = drift_turn(growth.given.factors, rows[at]) / np.sqrt(growth.noise.assumed[0])
-    found = float((turn * growth.posterior.residual[at]).sum())
-    by_noise = np.einsum('mi,miq->q', turn, growth.posterior.left_over(at))
-    variance = float((by_noise**2).mean())
+    found, variance = drift_left(growth), drift_information(growth)
     return (found / variance, found / np.sqrt(variance)) if variance > 0 else (0.0, 0.0)
 
 

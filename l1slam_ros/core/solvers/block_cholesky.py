@@ -118,8 +118,6 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
 
     By minimum degree; also by levels if a factorisation is long, by separators if it is vast.
 
-    Parameters
-    ----------
     keyframe, size : as in `LinearSystem`; k : size of a block
     before : of fewer keyframes and factors. Up to `GROWN` times as many, only keyframes that new
         factors join and those above them in the elimination tree are ordered anew: that takes a
@@ -200,13 +198,9 @@ class BlockCholesky:
     """
     Factors the normal matrices of all systems whose factors join the same keyframes.
 
-    Parameters
-    ----------
-    pattern : of `keyframe`, or of more
-    keyframe : (m, 2) as in `LinearSystem`
-    loose : (k,) columns that may move though nothing determines how, see `loose_keyframes`: they
-        are damped, by so little that whatever is determined does not feel it
-
+    pattern : of `keyframe`, or of more; keyframe : (m, 2) as in `LinearSystem`; loose : (k,)
+    columns that may move though nothing determines how, see `loose_keyframes`: they are damped,
+    by so little that whatever is determined does not feel it
     """
 
     def __init__(self, pattern: Pattern, keyframe: Indices, loose: Indices = _NONE):
@@ -272,6 +266,12 @@ class BlockCholesky:
         """Turn q right hand sides (free keyframes, k, q) into their solutions, in place."""
         layout = self._last
         kernels.prediction.solve_many(layout.panels, *layout.shape, self.pattern.position, right)
+
+    def log_det(self) -> float:
+        """Return the ln of the determinant of the matrix that was factored last."""
+        *_, corner, stride = self._last.places
+        pivots = corner[:, None] + np.arange(len(self._last.size)) * (stride[:, None] + 1)
+        return 2 * float(np.log(self._last.panels[pivots]).sum())
 
     def covariances(self, at: Indices, parent: Indices, turn: Array, kept: Array,
                     begins: Indices) -> tuple[Array, Array]:

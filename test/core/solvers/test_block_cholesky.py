@@ -50,7 +50,8 @@ def normal(system, weights, diagonal=0.0):
 
 
 def check_solution(cholesky, matrix, rng):
-    """Two right hand sides, to 1e-10 of what the matrix allows."""
+    """Two right hand sides, to 1e-10 of what the matrix allows, and the determinant."""
+    assert_allclose(cholesky.log_det(), np.linalg.slogdet(matrix)[1], rtol=1e-10, atol=1e-8)
     for _ in range(2):
         right = rng.standard_normal(len(matrix))
         expected = np.linalg.solve(matrix, right)

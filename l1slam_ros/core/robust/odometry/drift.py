@@ -14,11 +14,12 @@ the odometry without it, and which drift is to be believed. Wheels of unequal si
 with an offset, do that.
 
 `drift_likelihood` proposes drifts. Of laps that close also those by which each has a full turn
-more, so a map is made by each: the one that wins most places with the least noise is taken. Where
-another one is nearly as likely, the map is doubtful.
+more, so a map is made by each: the one by which the loops are likeliest is taken. Where another
+one is nearly as likely, the map is doubtful.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -26,16 +27,13 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
-from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL, log_prior
-from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES, Evidence
+from l1slam_ros.core.robust.innovation import claimed_volume, factorised, log_claims
+from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL
+from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import l2_map
 
-# A drift is believed of loops of so many places at least, if it is likelier by what these are
-# worth, or if no more than this part of them fits without it. Of 3 places one of 420 worlds has a
-# false drift, half (2) changed none of 89, double made 2 worse; without the part 5 of 40 are
-# worse, by half or double of it none of 89.
-_DRIFT_PLACES = 4
-_FEW = 0.1
 # Odometry whose variance is so many times what it states may drift; by half or double none of 89
 # runs is another.
 NOISY = 4.0
@@ -81,80 +79,136 @@ class Straight:
     found: Growth
     told: Growth
 
-    def log_odds(self, other: 'Straight') -> float:
-        """Return the ln of its odds against another drift, by what they lead to."""
-        usual = log_prior(self.drift, USUAL**2) - log_prior(other.drift, USUAL**2)
-        return float(usual) + _log_odds(self.told, other.told)
+    @cached_property
+    def log_room(self) -> float:
+        """The ln of the volume that a lie could claim on this map, in its units."""
+        return float(claimed_volume(se2, self.told.poses).sum())
+
+    @cached_property
+    def log_evidence(self) -> float:
+        """
+        Return ln p(loops if they are true | odometry) / p(loops if they are lies), one a place.
+
+        A loop alone at its place is one of many that could have fitted by chance. A drift d is
+        normal about none, and the map tells it as well as S, the inverse of a variance: of the
+        density of both the integral is left (P.-S. Laplace).
+        """
+        growth = self.told
+        alone = np.count_nonzero(np.bincount(growth.given.place[self.loops]) == 1)
+        known = np.log1p(USUAL**2 * drift_information(growth)) if self.drift else 0.0
+        return float(
+            _log_likelihood(growth, self._one_each) + len(self._one_each) * self.log_room
+            - alone * np.log(len(growth.given.factors)) - ((self.drift / USUAL)**2 + known) / 2)
+
+    def fits(self, loops: Indices, as_found: bool) -> tuple[float, int]:
+        """
+        Return the ln of how likely the others of its places are among some, and their count.
+
+        as_found : by the noise as it was found
+        """
+        others = np.setdiff1d(np.intersect1d(loops, self.loops), self._one_each)
+        if not len(others):
+            return 0.0, 0
+        growth = self.told.copy()
+        growth.noise = replace(growth.noise, at_their_word=not as_found)
+        both = np.union1d(others, self._one_each)
+        return (_log_likelihood(growth, both) - _log_likelihood(growth, self._one_each),
+                len(others))
+
+    @cached_property
+    def stretches(self) -> float:
+        """Along how many stretches more than places loops are."""
+        given = self.told.given
+        one, other = given.mates
+        loops = np.zeros(len(given.factors), bool)
+        loops[self.loops] = True
+        near = np.bincount(one, loops[other], len(loops))[self.loops]
+        return float((1 / (1 + near)).sum()) - len(self._one_each)
 
     def keeps_places(self, as_stated: Growth) -> bool:
         """Return whether loops of as many places are accepted as without."""
         return _places(as_stated, self.told) >= _places(as_stated, as_stated)
 
+    @cached_property
+    def _one_each(self) -> Indices:
+        place = self.told.given.place[self.loops]
+        return np.asarray(self.loops[np.unique(place, return_index=True)[1]])
 
-def likeliest(some: list[Straight], as_stated: Growth) -> tuple[Straight | None, float]:
+    @cached_property
+    def loops(self) -> Indices:
+        """The loops that are accepted, (k,)."""
+        return np.asarray(np.flatnonzero(self.told.accepted & self.told.given.is_loop))
+
+
+def likeliest(some: list[Straight]) -> tuple[Straight, float]:
     """
     Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0.
 
-    None where it does not explain the loops.
+    The first one is that without a drift. Where it explains loops, too, another has to be likelier
+    by what two places are worth, and to leave the odometry no noisier, as it would be if lies
+    came in by chance.
+
+    The other loops of a place agree, be it a mistake or not: they tell how noisy those are that
+    fit without. But the longer a place is, the larger is the map: on a smaller one there would be
+    more such places than loops were found at.
     """
-    best = None
-    for straight in some:
-        if not best or straight.log_odds(best) > 0:
-            best = straight
-    if not best or not _explains(best, as_stated):
-        return None, 0.0
-    odds, more = min(((best.log_odds(other), other.drift - best.drift)
-                      for other in some if other is not best), default=(np.inf, 0.0))
-    return best, more if odds < TWO_PLACES * as_stated.given.log_odds_of_place else 0.0
-
-
-def _log_odds(one: Growth, other: Growth) -> float:
-    """
-    Return the ln of the odds of one map against another, of odometry with and without a drift.
-
-    Of each place that only one of them accepts, half a gate. The variances q of odometry and of
-    loops were found, so what loops measure has a density proportional to det C(q)^-1/2, and the
-    derivative of ln det C by ln q are the degrees of freedom f that the map leaves of the kind:
-    1/2 sum f ln(q of the other / q).
-    """
-    freedom = sum(np.bincount(state.given.is_loop[state.accepted], np.trace(
-        state.posterior.moment, axis1=1, axis2=2), 2) for state in (one, other)) / 2
-    calmer = np.log(other.noise.variance / one.noise.variance)
-    more = _places(one, one) - _places(one, other)
-    return float(freedom @ calmer / 2 + more * one.given.log_odds_of_place)
-
-
-def _explains(straight: Straight, as_stated: Growth) -> bool:
-    """
-    Return whether loops need the odometry to be rid of a drift.
-
-    That is, hardly any fit without, or its odds are those of several places and the odometry is
-    no noisier, as it would be if lies came in by chance. A drift by which no place is won and
-    which is within what the odometry states is left, whether lies make it be asked for or not.
-    And the loops are of several places: a lap that closes at one place closes as well if it has a
-    turn more.
-    """
-    told = straight.told
-    loops, before = (np.flatnonzero(state.accepted & state.given.is_loop)
-                     for state in (told, as_stated))
-    if told.given.may_err_as_one(loops, _DRIFT_PLACES):
-        return False
-    noise = as_stated.noise.variance[0]
-    calmer = told.noise.variance[0] <= noise
-    needed = (noise > NOISY or _places(told, told) > _places(told, as_stated)
-              or not _is_stated(straight.drift, as_stated.given))
-    enough = _DRIFT_PLACES * told.given.log_odds_of_place
-    return (len(before) <= _FEW * len(loops)
-            or bool(needed and calmer and _log_odds(told, as_stated) >= enough))
-
-
-def _is_stated(drift: float, given: Evidence) -> bool:
-    """Return whether a drift is within what the odometry states, as a loop is within its gate."""
-    factors = given.factors
-    turn = drift * drift_turn(factors, np.flatnonzero(factors.is_odometry))
-    return bool((turn**2).sum() < given.gate(np.array([1]))[0])
+    widest = max(straight.log_room for straight in some)
+    values = np.array([straight.log_evidence + straight.stretches * (straight.log_room - widest)
+                       for straight in some])
+    sure = TWO_PLACES * some[0].told.given.log_odds_of_place
+    stated = len(some[0].loops) > 0
+    first = 0 if stated else int(np.argmax(values))
+    fits, count = np.array([straight.fits(some[first].loops, stated) for straight in some]).T
+    fitting = values + fits - count * fits[first] / max(count[first], 1)
+    if stated:
+        noise = np.array([straight.told.noise.variance[0] for straight in some])
+        fitting[noise > noise[0]] = -np.inf
+        fitting[0] += sure
+        first = int(np.argmax(fitting))
+    best = some[first]
+    less, more = min(((fitting[first] - value, other.drift - best.drift)
+                      for other, value in zip(some[1:], fitting[1:], strict=True)
+                      if other.drift != best.drift), default=(np.inf, 0.0))
+    return best, more if less < sure and best is not some[0] else 0.0
 
 
 def _places(known: Growth, growth: Growth) -> int:
     """Return of how many places, as one state knows them, the loops are that another accepts."""
     return len(np.unique(known.given.place[growth.accepted & growth.given.is_loop]))
+
+
+def _log_likelihood(growth: Growth, loops: Indices) -> float:
+    """
+    Return the ln of how likely some loops, (k,), are if they are true, by the odometry.
+
+    With the Jacobian J and the residuals r of both, whitened by roots of information U, H = J'J:
+
+        sum over loops (ln det U - 3/2 ln 2 pi) - (r'r + ln det H - ln det H_odometry) / 2
+    """
+    graph = growth.subgraph(np.union1d(
+        np.flatnonzero(growth.accepted & ~growth.given.is_loop), loops))
+    cholesky = cholesky_of(graph)
+    system = factorised(graph, l2_map(graph, growth.poses, cholesky), cholesky)
+    numbers = growth.given.factors.freedom[loops].sum()
+    square = float(system.b @ system.b) + numbers * np.log(2 * np.pi) + cholesky.log_det()
+    return float(log_claims(graph.between, np.zeros(3)).sum() - square / 2)
+
+
+def drift_information(growth: Growth) -> float:
+    """Return what a map says of the drift of its odometry, as the inverse of a variance."""
+    rows, turn = _turns(growth)
+    by_noise = np.einsum('mi,miq->q', turn, growth.posterior.left_over(rows))
+    return float((by_noise**2).mean())
+
+
+def drift_left(growth: Growth) -> float:
+    """Return what the residuals say of the drift that is left in a map, times its information."""
+    rows, turn = _turns(growth)
+    return float((turn * growth.posterior.residual[rows]).sum())
+
+
+def _turns(growth: Growth) -> tuple[Indices, Array]:
+    """Return the odometry among what is accepted, (k,), and its `drift_turn`, as it is weighed."""
+    rows = np.flatnonzero(growth.accepted)
+    at = np.flatnonzero(~(growth.given.is_loop | growth.cut)[rows])
+    return at, drift_turn(growth.given.factors, rows[at]) / np.sqrt(growth.noise.assumed[0])

@@ -36,7 +36,8 @@ def with_runs(growth: Growth) -> Growth | None:
     rows, loops = growth.undecided(), growth.accepted & given.is_loop
     rows = rows[~np.isin(given.place[rows], given.place[loops])]
     most = np.unique(given.place[rows], return_counts=True)[1].max(initial=0)
-    if most < RUN or growth.ventured.any() or given.may_err_as_one(np.flatnonzero(loops)):
+    if most < RUN or growth.ventured.any() or (
+            loops.any() and given.may_err_as_one(np.flatnonzero(loops))):
         return None
     noisier = growth.copy()
     noisier.noise = replace(noise, variance=noise.variance * (_NOISIER, 1.0))
@@ -51,7 +52,7 @@ def with_runs(growth: Growth) -> Growth | None:
     state.noise = replace(noise, variance=noisier.noise.variance)
     state.drops[:] = 0
     # Once from noise that is far too large, and once from what was left of that.
-    for _ in range(2):
+    for _ in range(2 if loops.any() else 8):
         state.noise = state.noise.forgotten()
         state.solve()
     state.accept_more()
