@@ -76,9 +76,10 @@ from l1slam_ros.core.robust.judgement import (
     judgement_of,
     listed,
 )
+from l1slam_ros.core.robust.odometry.cuts import join
 from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, likeliest, straightened
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
-from l1slam_ros.core.robust.odometry.slips import join, without_slip
+from l1slam_ros.core.robust.odometry.slips import without_slip
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.evidence import REFUSED
 from l1slam_ros.core.robust.rounds.growth import Growth
