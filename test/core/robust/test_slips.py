@@ -52,13 +52,23 @@ def test_without_a_slip_nothing_is_left_out(bad):
 
 
 @pytest.mark.parametrize('steps, offset', [([100, 180], [5.0, 0.0, 0.0]),
-                                           ([150, 230], [0.0, 0.0, 1.5])])
-def test_two_slips_are_found_together(bad, steps, offset):
-    """Each bends what the loops across the other one say."""
+                                           ([150, 230], [0.0, 0.0, 1.5]),
+                                           ([150, 230, 310], [0.0, 0.0, 0.7])])
+def test_slips_are_found_together(bad, steps, offset):
+    """Each bends what the loops across the others say: of three, the first was cut elsewhere."""
     graph = slipped(bad.graph, steps, offset)
     judgement, _ = robust_solve(graph)
     assert graph.between.i[judgement.slips].tolist() == steps
     assert not judgement.doubts
+
+
+def test_the_noise_that_few_loops_learnt_of_slips_is_forgotten_once_they_are_cut():
+    """All of them fit by noise ten times as large; cut by that, one of the two was doubtful."""
+    world = spoilt(careful_world(300, 312, 3), 'random', 4)
+    graph = slipped(world.graph, steps := [100, 200], [2.0, 0.0, 0.0])
+    judgement, _ = robust_solve(graph)
+    assert graph.between.i[judgement.slips].tolist() == steps and not judgement.doubts
+    assert judgement.variance[0] < 2.0
 
 
 def test_far_loops_alone_say_how_the_robot_moved_at_a_slip():

@@ -103,6 +103,11 @@ def without(growth: Growth, step: int, motion: Motion) -> tuple[Growth | None, f
         else:
             return None, 0.0
     state.accept_more()
+    if not (state.accepted & ~growth.accepted).any():
+        # The noise was learnt of the slip, too, and each time half of that stays.
+        for _ in range(3):
+            state.noise = state.noise.forgotten()
+            state.solve()
     return state, costs
 
 
