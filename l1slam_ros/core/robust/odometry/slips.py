@@ -15,9 +15,9 @@ out agree. Then slip and lies are compared: the step is cut, the loops across ar
 and that nothing else explains, less one for each that is lost. A slip is believed if that makes it
 likelier than not. Loops do not make a robot jump: the slip repaired, it has to move as at some
 other step, or rather so than as measured. If it does not, that is the price of the cut, and the
-slip is elsewhere, or there is one more: a cut is taken in spite of it only where no other will do,
-and moved when the next one shows where it belongs. What fits the loops that came in without it did
-not slip: a lie, or another slip, had bent the map.
+slip is elsewhere, or there is one more: a cut is taken in spite of it only where nothing else will
+do, and moved when the next one shows where it belongs. What fits the loops that came in without it
+did not slip: a lie, or another slip, had bent the map.
 """
 
 from collections.abc import Iterator
@@ -80,8 +80,11 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
                                  or growth.cut[one])
         if evidence > 0 and (usual, evidence) > most:
             found, most = state, (usual, evidence)
-            state.slip_odds.update(dict.fromkeys(steps.tolist(), evidence))
-    found = found or with_runs(growth)
+            state.slip_odds.update({
+                one: -jump[one] if jump[one] > SURE and odds[one] <= 0 else evidence
+                for one in steps.tolist()})
+    if not most[0]:  # an unusual cut is the last resort
+        found = with_runs(growth) or found
     if not found:
         growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion)
     return found
@@ -112,8 +115,9 @@ def _odds_in_the_end(growth: Growth, as_stated: Growth, motion: Motion) -> dict[
         now = log_odds_of_slips(growth, motion)
         last |= {step: float(now[step]) for step in growth.slip_odds if growth.cut[step]}
     last = {step: max(odds, growth.slip_odds.get(step, odds)) for step, odds in last.items()}
-    # Where the robot moves as it never does, the slip may be elsewhere.
-    return last | {step: -jump for step, jump in jumps(growth, motion).items() if jump > SURE}
+    # Cut in spite of a motion as there never is one, the slip may be elsewhere.
+    return last | {step: -jump for step, jump in jumps(growth, motion).items()
+                   if jump > SURE and growth.slip_odds.get(step, 0.0) < 0}
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None = None
