@@ -71,13 +71,13 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         usual = not any(jump.values())
         evidence = (_odds_of_cuts(growth, state, motion, odds, usual) - costs
                     + gain_of(growth, as_stated, state))
+        # Where loops said that it slipped, they said how it moved, too.
+        evidence += jumped - sum(much for one, much in jump.items() if odds[one] <= 0
+                                 or growth.cut[one])
         if not len(steps):
             _suspect(growth, step, float(log_odds_of_slips(state, motion)[step]))
         elif np.count_nonzero(state.cut != growth.cut) == 1:
             _suspect(growth, int(steps[0]), evidence)
-        # Where loops said that it slipped, they said how it moved, too.
-        evidence += jumped - sum(much for one, much in jump.items() if odds[one] <= 0
-                                 or growth.cut[one])
         if evidence > 0 and (usual, evidence) > most:
             found, most = state, (usual, evidence)
             state.slip_odds.update({
