@@ -49,7 +49,7 @@ A doubt
     is a rival explanation nearly as good as the one that won: `reasons` names it.
 
 No loop is factored before it is accepted, so none bends what it is judged by. Read on in `rounds`,
-`gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `slips`, `judgement`.
+`gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `cuts`, `slips`, `judgement`.
 """
 
 import time

@@ -142,18 +142,16 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None
             yield step, None, 0.0
             continue
         state = settled(state, motion)
-        gain = gain_of_places(growth, as_stated, state)
-        usual = not any(jumps(state, motion).values())
-        if costs and after is None and gain <= costs:  # as if it had fallen apart
+        won = gain_of_places(growth, as_stated, state) - costs
+        if costs and after is None and won <= 0:  # as if it had fallen apart
             yield step, None, 0.0
-        elif after is None:
-            yield step, put_back(state, motion), costs
         else:
-            yield step, state, costs
-        if after is None and (not usual or odds[step] + gain <= costs):
+            yield step, put_back(state, motion), costs
+        usual = not any(jumps(state, motion).values())
+        if after is None and (not usual or odds[step] + won <= 0):
             for _, both, more in _tried(state, state, motion, usual):
                 if both:
-                    yield step, put_back(both, motion), costs + more
+                    yield step, both, costs + more
 
 
 def _suspected(growth: Growth, motion: Motion, odds: Array, left_out: Indices, least: float
