@@ -16,7 +16,7 @@ and that nothing else explains, less one for each that is lost. A slip is believ
 likelier than not. Loops do not make a robot jump: the slip repaired, it has to move as at some
 other step, or rather so than as measured. If it does not, that is the price of the cut, and the
 slip is elsewhere, or there is one more: a cut is taken in spite of it only where nothing else will
-do, and moved when the next one shows where it belongs. What fits the loops that came in without it
+do, moved when the next one shows where it belongs, and given up, doubtful, if none does. What fits the loops that came in without it
 did not slip: a lie, or another slip, had bent the map.
 """
 
@@ -78,15 +78,24 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
             _suspect(growth, step, float(log_odds_of_slips(state, motion)[step]))
         elif np.count_nonzero(state.cut != growth.cut) == 1:
             _suspect(growth, int(steps[0]), evidence)
-        if evidence > 0 and (usual, evidence) > most:
+        if evidence > 0 and (usual, evidence) > most and (usual or not growth.returned):
             found, most = state, (usual, evidence)
             state.slip_odds.update({
                 one: -jump[one] if jump[one] > SURE and odds[one] <= 0 else evidence
                 for one in steps.tolist()})
     if not most[0]:  # an unusual cut is the last resort
-        found = with_runs(growth) or found
-    if not found:
-        growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion)
+        unusual, found = found, with_runs(growth)
+        if unusual and not found:
+            found = unusual
+            found.before = growth.before or growth
+    never = [step for step, jump in jumps(growth, motion).items()
+             if jump > SURE and growth.slip_odds.get(step, 0.0) < 0]
+    if not found and growth.before and never:
+        # No other cut made it usual: the robot jumps because lies say so, or nobody knows where.
+        found = growth.before
+        found.returned = dict.fromkeys(never, 0.0)
+    elif not found:
+        growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion) | growth.returned
     return found
 
 
