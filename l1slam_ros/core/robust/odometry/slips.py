@@ -16,8 +16,8 @@ and that nothing else explains, less one for each that is lost. A slip is believ
 likelier than not. Loops do not make a robot jump: the slip repaired, it has to move as at some
 other step, or rather so than as measured. If it does not, that is the price of the cut, and the
 slip is elsewhere, or there is one more: a cut is taken in spite of it only where nothing else will
-do, moved when the next one shows where it belongs, and given up, doubtful, if none does. What fits the loops that came in without it
-did not slip: a lie, or another slip, had bent the map.
+do, moved when the next one shows where it belongs, and given up, doubtful, if none does. What fits
+the loops that came in without it did not slip: a lie, or another slip, had bent the map.
 """
 
 from collections.abc import Iterator
