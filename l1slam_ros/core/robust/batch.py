@@ -48,7 +48,7 @@ A doubt
     is a rival explanation nearly as good as the one that won: `reasons` names it.
 
 No loop is factored before it is accepted, so none bends what it is judged by. Read on in `rounds`,
-`gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `slips`, `judgement`.
+`gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `cuts`, `slips`, `judgement`.
 """
 
 import time
@@ -81,10 +81,11 @@ from l1slam_ros.core.robust.judgement import (
     listed,
     so_far,
 )
+from l1slam_ros.core.robust.odometry.cuts import join
 from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, likeliest, straightened
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.robust.odometry.noisier import with_runs
-from l1slam_ros.core.robust.odometry.slips import join, without_slip
+from l1slam_ros.core.robust.odometry.slips import without_slip
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of

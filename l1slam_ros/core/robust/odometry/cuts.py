@@ -1,0 +1,221 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a cut of the odometry leads to: the sides of a step, joined by the loops across alone.
+
+In: a state of a robust solve, and a step that may have slipped. Out: the state without what it
+measured, and how unusual the motion is that is left there. Where both sides are parts of their
+own, each right in itself, the true loops across agree with each other (`pairwise_consistency`):
+parts are joined where loops of two places or more do. The sides of a gap are joined likewise.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.robust.odometry.motion import (
+    Motion,
+    log_odds_of_slips,
+    steps_of,
+    unwhitening,
+)
+from l1slam_ros.core.robust.odometry.untold import slips_told
+from l1slam_ros.core.robust.pairwise_consistency import (
+    Group,
+    asked,
+    by_pair_of_parts,
+    longest_run,
+    strongest_across,
+)
+from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
+from l1slam_ros.core.robust.rounds.growth import Growth
+
+
+def join(growth: Growth, by_runs: bool = False) -> bool:
+    """
+    Move parts to where loops across agree that they are; return whether any was.
+
+    by_runs : where loops of two places do not, those of one that is long may
+    """
+    joined = False
+    while (rows := growth.joining()).size:
+        group = strongest_across(growth)
+        if len(group.places) < TWO_PLACES and by_runs:
+            group = max((longest_run(growth, some) for some in by_pair_of_parts(growth, rows)),
+                        key=lambda group: len(group.rows))
+        elif len(group.places) < TWO_PLACES:
+            return joined
+        if not len(group.rows):
+            return joined
+        _join_by(growth, group)
+        joined = True
+    return joined
+
+
+def _join_by(growth: Growth, group: Group) -> None:
+    """Move the later one of two parts to where the first loop of a group says, accept all."""
+    given = growth.given
+    manifold, loop = given.graph.manifold, group.rows[0]
+    fixed, moving = given.low[loop], given.high[loop]
+    Z = given.factors.measurement[loop, None]
+    if growth.part[fixed] > growth.part[moving]:
+        fixed, moving, Z = moving, fixed, manifold.inverse(Z)
+    wanted = manifold.compose(growth.poses[fixed, None], Z)
+    motion = manifold.compose(wanted, manifold.inverse(growth.poses[moving, None]))
+    part = growth.part == growth.part[moving]
+    growth.poses = growth.poses.copy()
+    growth.poses[part] = manifold.compose(
+        np.broadcast_to(motion, growth.poses[part].shape), growth.poses[part])
+    growth.accepted[group.rows] = True
+    growth.solve()
+
+
+def without(growth: Growth, step: int, motion: Motion) -> tuple[Growth | None, float]:
+    """
+    Return the state after the rounds that follow if a step is cut, and what it costs, ln of odds.
+
+    None: it falls apart. Where loops of two places or a long run do not join its sides, those do
+    that came in before, else the one that shows a slip best: chosen, its place says nothing.
+    """
+    state, span = growth.copy(), growth.given.spanning(step)
+    state.cut[step] = True
+    state.drops[:] = 0
+    kept = state.copy()
+    costs = 0.0
+    told = (state.accepted & span).any()
+    if told:
+        state.accepted[span] = state.given.trusted[span]
+        state.solve()
+    else:  # each side stays as it is
+        state.label_parts()
+    if not join(state, by_runs=True) or state.across()[step]:
+        if told:
+            kept.solve()
+        if told and not kept.across()[step]:
+            state = kept
+        elif _join_as_usual(state, step, motion):
+            costs = state.given.log_odds_of_place
+        else:
+            return None, 0.0
+    state.accept_more()
+    if not (state.accepted & ~growth.accepted).any():
+        # The noise was learnt of the slip, too, and each time half of that stays.
+        for _ in range(3):
+            state.noise = state.noise.forgotten()
+            state.solve()
+    return state, costs
+
+
+def _join_as_usual(state: Growth, step: int, motion: Motion) -> bool:
+    """Join the sides of a step by the loop that shows a slip there rather than lies, or none."""
+    given, part = state.given, state.part
+    cut = np.array([step])
+    rows = state.joining()
+    rows = asked(state, rows[(part[given.low[rows]] == part[given.low[step]])
+                             & (part[given.high[rows]] == part[given.high[step]])
+                             & (given.factors.freedom[rows] == len(motion.mean))])
+    told = slips_told(state, motion, cut, rows)[:, 0]
+    if told.max(initial=-np.inf) < motion.log_density(steps_of(state, cut))[0]:
+        return False
+    best = rows[[np.argmax(told)]]
+    _join_by(state, Group(best, given.place[best]))
+    return not state.across()[step]
+
+
+def settled(state: Growth, motion: Motion) -> Growth:
+    """Return the state, each step cut moved to where the robot, repaired, moves most as usual."""
+    for cut in np.flatnonzero(state.cut & ~state.given.gap).tolist():
+        step = _likeliest(state, cut, motion)
+        if step != cut:
+            state = _cut_at(state, cut, step)
+    return state
+
+
+def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
+    """Return the step that slipped, by how the robot moves, of those that no loop tells apart."""
+    given = state.given
+    loops = given.is_loop & state.accepted
+    ends = np.unique((given.low[loops], given.high[loops]))
+    stretch = np.searchsorted(ends, given.low, side='right')
+    odometry = ~given.is_loop & (~state.cut | (np.arange(len(state.cut)) == cut))
+    steps = np.flatnonzero(odometry & (stretch == stretch[cut]))
+    gain = motion.log_density(*_repaired(state, cut, steps)) - motion.log_density(
+        steps_of(state, steps))
+    return int(steps[np.argmax(gain)])
+
+
+def _cut_at(state: Growth, cut: int, step: int) -> Growth:
+    """Return the state that is cut at a step and not where it is."""
+    state, given = state.copy(), state.given
+    state.cut[[cut, step]] = False, True
+    # What lies between goes over to the other side.
+    side = given.low[cut] if given.low[step] > given.low[cut] else given.high[cut]
+    between = np.arange(*np.sort(given.high[[cut, step]]))
+    chain, manifold = given.chain, given.graph.manifold
+    here, start = (np.tile(poses[side], (len(between), 1)) for poses in (state.poses, chain))
+    state.poses = state.poses.copy()
+    state.poses[between] = manifold.compose(here, manifold.between(start, chain[between]))
+    state.solve()
+    state.accept_more()
+    return state
+
+
+def put_back(state: Growth, motion: Motion) -> Growth:
+    """Return the state where steps say what they measured, where that fits."""
+    steps = np.flatnonzero(state.cut & ~state.given.gap)
+    found = state.uncut().innovations(steps)
+    fits = ((log_odds_of_slips(state, motion)[steps] <= 0)
+            & (found.square < state.given.gate(found.freedom)))
+    if fits.any():
+        state = state.copy()
+        state.cut[steps[fits]] = False
+        state.solve()
+    return state
+
+
+def jumps(state: Growth, motion: Motion) -> dict[int, float]:
+    """
+    Return of each step that is cut how much likelier it moved as measured than as repaired, ln.
+
+    0 where the robot, repaired, moves as elsewhere.
+    """
+    gate = state.given.gate(np.array([len(motion.mean)]))[0]
+    # All may be as noisy as they turn out, or as they say.
+    said = state.noise.word[0] / state.noise.variance[0]
+    found = {}
+    for cut in np.flatnonzero(state.cut & ~state.given.gap).tolist():
+        row = np.array([cut])
+        repaired, spread = _repaired(state, cut, row)
+        density = max(motion.log_density(repaired, noise * spread)[0] for noise in (1.0, said))
+        jump = motion.log_density(steps_of(state, row))[0] - density
+        usual = motion.distance(repaired[0], spread[0]).min() < gate
+        found[cut] = 0.0 if usual else max(float(jump), 0.0)
+    return found
+
+
+def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
+    """
+    Return how the robot moved at some steps if one of these slipped rather than that which is cut.
+
+    Tangents (m, k) and their covariances (m, k, k): all that follows is moved alike.
+    """
+    given = state.given
+    manifold, chain = given.graph.manifold, given.chain
+    measured = state.uncut()
+    row = np.array([cut])
+    count = len(steps)
+    root, spread = unwhitening(measured, row), measured.innovations(row).spread
+    low, high = given.low[row], given.high[row]
+    moved = manifold.between(state.poses[low], state.poses[high])
+    before = manifold.between(chain[given.low[steps]], np.repeat(chain[low], count, axis=0))
+    after = manifold.between(np.repeat(chain[high], count, axis=0), chain[given.high[steps]])
+    moved = manifold.compose(manifold.compose(before, np.repeat(moved, count, axis=0)), after)
+    start = manifold.identity(count)
+    carried = manifold.local_jacobian(start, moved) @ manifold.adjoint(
+        manifold.inverse(after)) @ root
+    return manifold.local(start, moved), carried @ spread @ carried.transpose(0, 2, 1)
