@@ -33,6 +33,7 @@ from l1slam_ros.core.robust.innovation import (
     innovations,
     sample_posterior,
 )
+from l1slam_ros.core.robust.inspection import repeated_factors
 from l1slam_ros.core.robust.places import beside_refused
 from l1slam_ros.core.robust.rounds.evidence import evidence_of
 from l1slam_ros.core.robust.rounds.noise import Noise
@@ -98,7 +99,9 @@ class Growth:
         self._tie_to_world()
         self.solve()
         rows = self.undecided()
-        rows = rows[~self.given.factors.is_absolute[rows]]
+        # A factor that stands there twice fits itself, whatever the noise.
+        rows = np.setdiff1d(rows[~self.given.factors.is_absolute[rows]],
+                            repeated_factors(self.given.graph))
         # Else the noise that is learnt of them would fit their mistake.
         if not self.given.may_err_as_one(rows):
             self.noise = self.noise.found(
