@@ -88,15 +88,24 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if unusual and not found:
             found = unusual
             found.before = growth.before or growth
-    never = [step for step, jump in jumps(growth, motion).items()
-             if jump > SURE and growth.slip_odds.get(step, 0.0) < 0]
-    if not found and growth.before and never:
-        # No other cut made it usual: the robot jumps because lies say so, or nobody knows where.
-        found = growth.before
-        found.returned = dict.fromkeys(never, 0.0)
-    elif not found:
+    found = found or _given_up(growth, motion)
+    if not found:
         growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion) | growth.returned
     return found
+
+
+def _given_up(growth: Growth, motion: Motion) -> Growth | None:
+    """
+    Return the state before an unusual cut that no other one made usual; None: there is none.
+
+    The robot jumps because lies say so, or nobody knows where.
+    """
+    never = [step for step, jump in jumps(growth, motion).items()
+             if jump > SURE and growth.slip_odds.get(step, 0.0) < 0]
+    if not growth.before or not never:
+        return None
+    growth.before.returned = dict.fromkeys(never, 0.0)
+    return growth.before
 
 
 def _suspect(growth: Growth, step: int, odds: float) -> None:
