@@ -52,8 +52,8 @@ TINY = 1e-9
 # A factor of ten that files are off has to be worth so much, ln: a few lies are no measure. Half
 # and double make none worse.
 _DECADE_COSTS = 5.0
-# Pairs are formed of so many factors; half and double change 8 and 5, none is worse.
-PAIRED = 200
+# Pairs are formed of so many factors that fit best; half and double change 8 and 5, none is worse.
+_CANDIDATES = 200
 
 
 def log_odds_of_false(log_ratio: Array, others: int, believed: int = 0) -> float:
@@ -201,7 +201,7 @@ def _pairs(found: Innovations, posterior: Posterior, rows: Indices, log_ratio: A
     The one and the other, (pairs,) each, the square and the log ratio of both, see
     `Innovations.joint`.
     """
-    best = rows[np.argsort(-log_ratio[rows], kind='stable')[:PAIRED]]
+    best = rows[np.argsort(-log_ratio[rows], kind='stable')[:_CANDIDATES]]
     a, b = (best[side] for side in np.triu_indices(len(best), 1))
     a, b = (ends[place[a] != place[b]] for ends in (a, b))
     square, both = found.joint(posterior, a, b) if len(a) else (np.zeros(0), np.zeros(0))

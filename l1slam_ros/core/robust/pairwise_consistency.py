@@ -25,13 +25,15 @@ from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.graph.spanning_tree import pair_key
-from l1slam_ros.core.robust.gating import DOUBT, PAIRED
+from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.innovation import claimed_volume, log_claims, log_likelihood_ratio
 from l1slam_ros.core.robust.places import NEAR
 from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 
 # First ends, second ends and measurements of loops.
 Ends = tuple[Indices, Indices, Array]
+# So many loops are asked.
+ASKED = 250
 # Of each one so many pairs are looked at closely, those that differ least.
 _NEAREST = 20
 # A run has so many loops, and each agrees with half as many others of it.
@@ -152,9 +154,9 @@ def agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
 
 
 def asked(growth: Growth, rows: Indices) -> Indices:
-    """Return `PAIRED` of some loops, as if at random, or all, (k,)."""
+    """Return `ASKED` of some loops, as if at random, or all, (k,)."""
     order = np.argsort(keys(growth.given.low[rows], growth.given.high[rows]))
-    chosen: Indices = rows[order[:PAIRED]]
+    chosen: Indices = rows[order[:ASKED]]
     return chosen
 
 
