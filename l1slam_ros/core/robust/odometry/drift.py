@@ -168,7 +168,7 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float]:
     best = some[first]
     less, more = min(((fitting[first] - value, other.drift - best.drift)
                       for other, value in zip(some[1:], fitting[1:], strict=True)
-                      if other.drift != best.drift), default=(np.inf, 0.0))
+                      if other.drift != best.drift and len(other.loops)), default=(np.inf, 0.0))
     return best, more if less < sure and best is not some[0] else 0.0
 
 

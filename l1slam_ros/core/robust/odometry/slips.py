@@ -77,7 +77,9 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if not len(steps):
             _suspect(growth, step, float(log_odds_of_slips(state, motion)[step]))
         elif np.count_nonzero(state.cut != growth.cut) == 1:
-            _suspect(growth, int(steps[0]), evidence)
+            # What no cut explains as a robot moves still does not fit.
+            as_said = -np.inf if usual else float(odds[steps[0]]) - costs
+            _suspect(growth, int(steps[0]), max(evidence, as_said))
         if evidence > 0 and (usual, evidence) > most and (usual or not growth.returned):
             found, most = state, (usual, evidence)
             state.slip_odds.update({
@@ -100,11 +102,11 @@ def _given_up(growth: Growth, motion: Motion) -> Growth | None:
 
     The robot jumps because lies say so, or nobody knows where.
     """
-    never = [step for step, jump in jumps(growth, motion).items()
-             if jump > SURE and growth.slip_odds.get(step, 0.0) < 0]
+    never = {step: -jump for step, jump in jumps(growth, motion).items()
+             if jump > SURE and growth.slip_odds.get(step, 0.0) < 0}
     if not growth.before or not never:
         return None
-    growth.before.returned = dict.fromkeys(never, 0.0)
+    growth.before.returned = never
     return growth.before
 
 
