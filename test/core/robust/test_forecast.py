@@ -67,7 +67,7 @@ def test_a_map_without_an_accepted_loop_is_hardly_ever_right():
     factors.measurement[turned, :2] += np.random.default_rng(0).uniform(
         20, 60, (np.count_nonzero(turned), 2))
     found, _ = robust_solve(graph)
-    assert WEAK in [doubt.kind for doubt in found.doubts]
+    assert [doubt.kind for doubt in found.doubts] == [WEAK]
     assert found.confidence < 0.2 and forecast(found.terms) == found.confidence
 
 

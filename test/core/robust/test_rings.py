@@ -69,12 +69,14 @@ def test_the_smaller_map_that_lies_would_fit_is_not_made_by_a_drift(seed):
     assert position_error(poses, truth) < 3
 
 
-@pytest.mark.parametrize('seed', [0, 1, 7])
+@pytest.mark.parametrize('seed', range(8))
 def test_of_turns_more_that_loops_fit_the_one_is_taken_that_leaves_the_largest_map(seed):
-    """Not beyond doubt: by another drift the lap is driven the other way round, say."""
+    """Not beyond doubt, and right in three of eight: the lap may be driven the other way round."""
     graph, truth = ring(400, 20, seed)
     drift = -0.06  # more than a turn and a half on the lap the other way round
     poses, judgement, doubts = judged(
         straightened(with_lies(graph, truth, 'random', 15, seed), -drift))
-    assert judgement.drift == pytest.approx(drift, abs=2e-3)
-    assert position_error(poses, truth) < 3 and doubts == {DRIFTS}
+    assert doubts
+    if seed in (0, 1, 7):
+        assert judgement.drift == pytest.approx(drift, abs=2e-3)
+        assert position_error(poses, truth) < 3 and doubts == {DRIFTS}
