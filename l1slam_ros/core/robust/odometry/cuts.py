@@ -10,7 +10,7 @@
 What a cut of the odometry leads to: the sides of a step, joined by the loops across alone.
 
 In: a state of a robust solve, and a step that may have slipped. Out: the state without what it
-measured, and how unusual the motion is that is left there. Where both sides are parts of their
+measured, and whether the motion is usual that is left there. Where both sides are parts of their
 own, each right in itself, the true loops across agree with each other (`pairwise_consistency`):
 parts are joined where loops of two places or more do. The sides of a gap are joined likewise.
 """
@@ -178,24 +178,25 @@ def put_back(state: Growth, motion: Motion) -> Growth:
     return state
 
 
-def jumps(state: Growth, motion: Motion) -> dict[int, float]:
+def unusual(state: Growth, motion: Motion) -> Indices:
     """
-    Return of each step that is cut how much likelier it moved as measured than as repaired, ln.
+    Return the steps that are cut where the robot, repaired, does not move as elsewhere, (k,).
 
-    0 where the robot, repaired, moves as elsewhere.
+    Nor rather so than as measured: a slip is as rare as a mistake that many loops share. So the
+    odds of the one against the other are those of the motion that each leaves.
     """
     gate = state.given.gate(np.array([len(motion.mean)]))[0]
     # All may be as noisy as they turn out, or as they say.
     said = state.noise.word[0] / state.noise.variance[0]
-    found = {}
+    found = []
     for cut in np.flatnonzero(state.cut & ~state.given.gap).tolist():
         row = np.array([cut])
         repaired, spread = _repaired(state, cut, row)
         density = max(motion.log_density(repaired, noise * spread)[0] for noise in (1.0, said))
-        jump = motion.log_density(steps_of(state, row))[0] - density
-        usual = motion.distance(repaired[0], spread[0]).min() < gate
-        found[cut] = 0.0 if usual else max(float(jump), 0.0)
-    return found
+        if (motion.distance(repaired[0], spread[0]).min() >= gate
+                and density <= motion.log_density(steps_of(state, row))[0]):
+            found.append(cut)
+    return np.array(found, np.int64)
 
 
 def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:

@@ -14,10 +14,8 @@ out agree. Then slip and lies are compared: the step is cut, the loops across ar
 (`cuts`), and the rounds go on from there. To the odds comes half a gate for each place that is won
 and that nothing else explains, less one for each that is lost. A slip is believed if that makes it
 likelier than not. Loops do not make a robot jump: the slip repaired, it has to move as at some
-other step, or rather so than as measured. If it does not, that is the price of the cut, and the
-slip is elsewhere, or there is one more: a cut is taken in spite of it only where nothing else will
-do, moved when the next one shows where it belongs, and given up, doubtful, if none does. What fits
-the loops that came in without it did not slip: a lie, or another slip, had bent the map.
+other step, or rather so than as measured. What fits the loops that came in without it did not
+slip: a lie, or another slip, had bent the map.
 """
 
 from collections.abc import Iterator
@@ -26,15 +24,14 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.robust.gating import DOUBT
-from l1slam_ros.core.robust.odometry.cuts import jumps, put_back, settled, without
+from l1slam_ros.core.robust.odometry.cuts import put_back, settled, unusual, without
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
     log_odds_of_slips,
-    steps_of,
     usual_motion,
 )
 from l1slam_ros.core.robust.odometry.noisier import with_runs
-from l1slam_ros.core.robust.odometry.untold import LEAST, slips_told, untold_slip
+from l1slam_ros.core.robust.odometry.untold import LEAST, untold_slip
 from l1slam_ros.core.robust.pairwise_consistency import gain_of, spanned, strongest_group
 from l1slam_ros.core.robust.rounds.evidence import FEWEST_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
@@ -60,54 +57,27 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     if np.count_nonzero(~growth.given.is_loop & ~growth.cut) < _FEWEST_STEPS:
         return None
     motion = usual_motion(growth)
-    odds, jumped = log_odds_of_slips(growth, motion), sum(jumps(growth, motion).values())
-    found, most = None, (False, 0.0)
+    odds = log_odds_of_slips(growth, motion)
+    found, most = None, 0.0
     for step, state, costs in _tried(growth, as_stated, motion):
         steps = np.flatnonzero(state.cut & ~growth.cut) if state else np.array([step])
         if not state or (costs and not len(steps)):  # a loop that was chosen shows a slip, or none
             _suspect(growth, step, float(odds[step]))
             continue
-        jump = jumps(state, motion)
-        usual = not any(jump.values())
-        evidence = (_odds_of_cuts(growth, state, motion, odds, usual) - costs
-                    + gain_of(growth, as_stated, state))
-        # Where loops said that it slipped, they said how it moved, too.
-        evidence += jumped - sum(much for one, much in jump.items() if odds[one] <= 0
-                                 or growth.cut[one])
+        usual = not np.isin(steps, unusual(state, motion)).any()
+        evidence = _odds_of_cuts(growth, state, motion, odds, usual) - costs
+        evidence += gain_of(growth, as_stated, state) if usual else 0.0
         if not len(steps):
             _suspect(growth, step, float(log_odds_of_slips(state, motion)[step]))
         elif np.count_nonzero(state.cut != growth.cut) == 1:
-            # What no cut explains as a robot moves still does not fit.
-            as_said = -np.inf if usual else float(odds[steps[0]]) - costs
-            _suspect(growth, int(steps[0]), max(evidence, as_said))
-        if evidence > 0 and (usual, evidence) > most and (usual or not growth.returned):
-            found, most = state, (usual, evidence)
-            state.slip_odds.update({
-                one: -jump[one] if jump[one] > SURE and odds[one] <= 0 else evidence
-                for one in steps.tolist()})
-    if not most[0]:  # an unusual cut is the last resort
-        unusual, found = found, with_runs(growth)
-        if unusual and not found:
-            found = unusual
-            found.before = growth.before or growth
-    found = found or _given_up(growth, motion)
+            _suspect(growth, int(steps[0]), evidence)
+        if evidence > most and (usual or (odds[steps] > 0).all()):
+            found, most = state, evidence
+            state.slip_odds.update(dict.fromkeys(steps.tolist(), evidence))
+    found = found or with_runs(growth)
     if not found:
-        growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion) | growth.returned
+        growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion)
     return found
-
-
-def _given_up(growth: Growth, motion: Motion) -> Growth | None:
-    """
-    Return the state before an unusual cut that no other one made usual; None: there is none.
-
-    The robot jumps because lies say so, or nobody knows where.
-    """
-    never = {step: -jump for step, jump in jumps(growth, motion).items()
-             if jump > SURE and growth.slip_odds.get(step, 0.0) < 0}
-    if not growth.before or not never:
-        return None
-    growth.before.returned = never
-    return growth.before
 
 
 def _suspect(growth: Growth, step: int, odds: float) -> None:
@@ -134,10 +104,7 @@ def _odds_in_the_end(growth: Growth, as_stated: Growth, motion: Motion) -> dict[
         # More is known than when it was cut.
         now = log_odds_of_slips(growth, motion)
         last |= {step: float(now[step]) for step in growth.slip_odds if growth.cut[step]}
-    last = {step: max(odds, growth.slip_odds.get(step, odds)) for step, odds in last.items()}
-    # Cut in spite of a motion as there never is one, the slip may be elsewhere.
-    return last | {step: -jump for step, jump in jumps(growth, motion).items()
-                   if jump > SURE and growth.slip_odds.get(step, 0.0) < 0}
+    return {step: max(odds, growth.slip_odds.get(step, odds)) for step, odds in last.items()}
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None = None
@@ -167,7 +134,7 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None
             yield step, None, 0.0
         else:
             yield step, put_back(state, motion), costs
-        usual = not any(jumps(state, motion).values())
+        usual = not len(unusual(state, motion))
         if after is None and (not usual or odds[step] + won <= 0):
             for _, both, more in _tried(state, state, motion, usual):
                 if both:
@@ -178,8 +145,6 @@ def _suspected(growth: Growth, motion: Motion, odds: Array, left_out: Indices, l
                ) -> list[int]:
     """
     Return the odometry factors that may have slipped: two by their odds, two by groups.
-
-    Of a group the one where the robot moved most as usual, if what its loops say is true.
 
     least : how large the odds are against those that are suspected for their own, at most
     """
@@ -198,9 +163,7 @@ def _suspected(growth: Growth, motion: Motion, odds: Array, left_out: Indices, l
         common = common_steps(growth, group.rows)
         common = common[~growth.cut[common]]
         if len(common):
-            usual = np.median(slips_told(growth, motion, common, group.rows), axis=0)
-            rather = usual - motion.log_density(steps_of(growth, common))
-            suspects.append(int(common[np.argmax(rather)]))
+            suspects.append(int(common[np.argmax(odds[common])]))
         left_out = np.setdiff1d(left_out, group.rows)
     return list(dict.fromkeys(suspects))
 

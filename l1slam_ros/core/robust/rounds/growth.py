@@ -69,8 +69,7 @@ class Growth:
     given : the evidence; accepted : (m,) bool of its factors; cut : (m,) bool, odometry that says
     nothing: the gaps, and where it slipped; part : (n,) number of the part of each keyframe;
     poses : (n, p) the L2 map of the accepted; posterior : of these; noise : as it was found;
-    slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected; before :
-    the state before any cut that left an unusual motion; returned : such cuts that were given up;
+    slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
     ventured : (m,) bool, loops of runs that noisier odometry explained; drops : (m,) how often
     each was accepted and did not fit; fits_found : (m,) bool, not the loops that do not fit by the
     noise that was found; check : called before long steps, raises where the work shall stop.
@@ -87,8 +86,6 @@ class Growth:
         self.posterior: Posterior
         self._order: ChangingOrder | None = None
         self.slip_odds: dict[int, float] = {}
-        self.before: Growth | None = None
-        self.returned: dict[int, float] = {}
         none = np.zeros(len(given.factors), bool)
         self.ventured = none
         self.fits_found = ~none
