@@ -139,7 +139,11 @@ def robust_solve(
 
 
 class _Repair:
-    """What loops left out may be right by: drift [rad/m]; rival: by how much more it may be."""
+    """
+    What loops that are left out may be right by.
+
+    drift : that of the odometry [rad/m]; rival : by how much more it may be.
+    """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None]):
         self._graph = graph
@@ -159,25 +163,29 @@ class _Repair:
         asked = len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISY
         drifts = likely_drifts(self._graph).tolist() if asked else []
         if drifts:
-            others = drifts if len(stated.loops) else [*drifts, 0.0]
-            best, self.rival = likeliest([stated, *(straight for drift in others
-                                                    for straight in self._without(drift))])
+            some = [stated, *(end for drift in drifts for end in self._without(drift))]
+            begun = None if len(stated.loops) else with_runs(found)
+            best, self.rival = likeliest(some + (self._ends(0.0, begun) if begun else []))
         taken = drift_taken_for_noise(as_stated) if best is stated else 0.0
-        best = next((straight for straight in (self._without(taken) if taken else ())
-                     if straight.keeps_places(as_stated)), best)
+        if taken:
+            best = next((end for end in self._without(taken) if end.keeps_places(as_stated)), best)
         self.drift = best.drift
         return None if best is stated else best.found
 
     def _without(self, drift: float) -> list[Straight]:
-        """Return what odometry without a drift leads to, none, [], where that has no end."""
+        """Return what odometry without a drift leads to."""
         growth = Growth(straightened(self._graph, drift), self._check)
+        growth.begin()
+        return self._ends(drift, growth)
+
+    def _ends(self, drift: float, growth: Growth) -> list[Straight]:
+        """Return where rounds from a state end, by runs again if without loops; [] : nowhere."""
         ends: list[Straight] = []
 
         def ended(*states: Growth) -> Growth | None:
             ends.append(Straight(drift, *states))
             return None if len(ends[-1].loops) else with_runs(states[0])
 
-        growth.begin()
         for _ in rounds(growth, ended):
             self._check()
         return ends

@@ -35,6 +35,9 @@ from l1slam_ros.core.robust.pairwise_consistency import (
 from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 
+# Each time that noise is learnt anew, half of what it was learnt of before stays.
+_LEARNT_ANEW = 3
+
 
 def join(growth: Growth, by_runs: bool = False) -> bool:
     """
@@ -104,10 +107,7 @@ def without(growth: Growth, step: int, motion: Motion) -> tuple[Growth | None, f
             return None, 0.0
     state.accept_more()
     if not (state.accepted & ~growth.accepted).any():
-        # The noise was learnt of the slip, too, and each time half of that stays.
-        for _ in range(3):
-            state.noise = state.noise.forgotten()
-            state.solve()
+        state.learn_noise_anew(_LEARNT_ANEW)  # it was learnt of the slip, too
     return state, costs
 
 

@@ -81,6 +81,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
 
 
 def _suspect(growth: Growth, step: int, odds: float) -> None:
+    """Note the odds of a step to have slipped, ln, if no other attempt showed larger ones."""
     growth.slip_odds[step] = max(odds, growth.slip_odds.get(step, odds))
 
 
@@ -123,7 +124,7 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None
     # Where loops are left out, one more place may be won.
     most = max(SURE, growth.given.log_odds_of_place) if len(left_out) else SURE
     least = most if after is None else SURE if after else np.inf
-    for step in _suspected(growth, motion, odds, left_out[:0] if after else left_out, least):
+    for step in _suspected(growth, odds, left_out[:0] if after else left_out, least):
         state, costs = without(growth, step, motion)
         if not state:
             yield step, None, 0.0
@@ -141,8 +142,7 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None
                     yield step, both, costs + more
 
 
-def _suspected(growth: Growth, motion: Motion, odds: Array, left_out: Indices, least: float
-               ) -> list[int]:
+def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> list[int]:
     """
     Return the odometry factors that may have slipped: two by their odds, two by groups.
 

@@ -240,6 +240,12 @@ class Growth:
             self.fits_found[tail] = True
             self.accept_more()
 
+    def learn_noise_anew(self, times: int) -> None:
+        """Solve, and learn the noise of what is accepted now alone, again and again."""
+        for _ in range(times):
+            self.noise = self.noise.forgotten()
+            self.solve()
+
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
         while True:
