@@ -64,6 +64,9 @@ IN_TURN = ('--ros-args', '-p', 'backlog:=1000', '-p', f'{_OF_SCANS}.reliability:
 # The map is final when the node has said so often [diagnostics, one a second] the same of it.
 CALM = 3
 OF_THE_MAP = ('keyframes', 'factors', 'updates', 'l1_cost')
+# The gate leaves out one true loop in a thousand; of which loops, depends on those that the scans
+# add. More than this part of the recorded ones is a fault.
+SUSPECT = 0.01
 # Given up only when nothing has moved for so long [s]; the node can be compiling its solver.
 PATIENCE = 120.0
 END = 60.0  # [s] longest that a process may take to end when it is told to
@@ -143,9 +146,9 @@ class Heard:
         known = set(loops)
         return [state for ends, state in self.states.items() if ends not in known]
 
-    def refused(self, loops: list[tuple[int, int]]) -> np.ndarray:
-        """Return which of some loops are not in the map, bool."""
-        return np.array([self.states.get(loop) != 'accepted' for loop in loops], bool)
+    def are(self, state: str, loops: list[tuple[int, int]]) -> np.ndarray:
+        """Return of which of some loops this has become, bool."""
+        return np.array([self.states.get(loop) == state for loop in loops], bool)
 
 
 class Listener:
@@ -294,13 +297,14 @@ def summarise(recording: Recording, heard: Heard, picture: Path) -> str:
     errors = (absolute_trajectory_error(odometry, truth),
               absolute_trajectory_error(positions, truth))
     note = f'position error {errors[0]:.2f} m by odometry, {errors[1]:.2f} m optimised'
-    refused, false = heard.refused(recording.loop_stamps), recording.is_false
+    (refused, suspect), false = left_out(recording, heard), recording.is_false
+    left = refused | suspect
     loops = np.searchsorted(stamps, recording.stamps[recording.loops])
     found = heard.found(recording.loop_stamps)
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_maps(picture, [MapDrawing('l1slam_ros demo', positions, odometry,
-                                   aligned_positions(truth, positions), loops[~refused & ~false],
-                                   rejected=loops[refused], false=loops[~refused & false],
+                                   aligned_positions(truth, positions), loops[~left & ~false],
+                                   rejected=loops[left], false=loops[~left & false],
                                    note=note, ground=_ground(heard.ground))])
     return '\n'.join((
         f'position error  {errors[0]:.3f} m by odometry, {errors[1]:.3f} m in the map (RMSE)',
@@ -308,6 +312,7 @@ def summarise(recording: Recording, heard: Heard, picture: Path) -> str:
         'false',
         f'refused         {(refused & false).sum()} false loops, {(refused & ~false).sum()} true '
         'ones',
+        *([f'left out        {suspect.sum()} true loops, as suspect'] if suspect.any() else []),
         f'from the scans  {len(found)} more loops, {sum(state != "accepted" for state in found)} '
         'of them not in the map',
         f'picture         {picture}'))
@@ -322,20 +327,29 @@ def _ground(message: OccupancyGrid | None) -> Ground | None:
                   meta.resolution)
 
 
+def left_out(recording: Recording, heard: Heard) -> tuple[np.ndarray, np.ndarray]:
+    """Return the loops that are refused, and the true ones that are suspect only, bool each."""
+    suspect = heard.are('suspect', recording.loop_stamps) & ~recording.is_false
+    return ~heard.are('accepted', recording.loop_stamps) & ~suspect, suspect
+
+
 def require_the_truth(recording: Recording, heard: Heard) -> None:
     """
-    Check that the node refused the false loops and no other.
+    Check that no false loop is in the map, no true one refused, and hardly any left out.
 
     Raises
     ------
-    DemoError : it did not.
+    DemoError : it is not so.
 
     """
-    refused, false = heard.refused(recording.loop_stamps), recording.is_false
+    (refused, suspect), false = left_out(recording, heard), recording.is_false
     if (refused != false).any():
         raise DemoError(f'{(refused & false).sum()} false loops are refused and '
                         f'{(refused & ~false).sum()} true ones, expected all {false.sum()} '
                         'false ones and no true one')
+    if suspect.sum() > SUSPECT * (~false).sum():
+        raise DemoError(f'{suspect.sum()} true loops are left out as suspect, expected at most '
+                        f'{SUSPECT:.0%} of {(~false).sum()}')
 
 
 def main() -> int:
