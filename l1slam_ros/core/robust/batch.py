@@ -64,8 +64,14 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
+from l1slam_ros.core.robust.as_measured import Believed, OnRound, as_measured
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
-from l1slam_ros.core.robust.innovation import BY_CHANCE, chi2_quantile, covariances, spread_of
+from l1slam_ros.core.robust.innovation import (
+    BY_CHANCE,
+    chi2_quantile,
+    covariances,
+    spread_of,
+)
 from l1slam_ros.core.robust.judgement import (
     NORM,
     UNSOLVED,
@@ -81,7 +87,6 @@ from l1slam_ros.core.robust.odometry.drift import NOISY, Straight, likeliest, st
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.robust.odometry.noisier import with_runs
 from l1slam_ros.core.robust.odometry.slips import without_slip
-from l1slam_ros.core.robust.places import first_told
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
@@ -95,12 +100,8 @@ _MOST_ROUNDS = 200
 # What a factorisation, or numbers beyond double precision, end in.
 _FAILURES = (GraphError, np.linalg.LinAlgError)
 
-# From the round and the loops accepted so far.
-OnRound = Callable[[int, int], None]
-# A judgement, and the map (n, p) of what it accepts.
-Believed = tuple[Judgement, Array]
 
-
+@as_measured
 def robust_solve(
     graph: FactorGraph, report: OnRound = lambda round_, accepted: None,
     check: Callable[[], None] = lambda: None, known: Believed | None = None,
@@ -118,11 +119,6 @@ def robust_solve(
     known : what was believed before and stays if this fails; None: what was in the last round
 
     """
-    rows, which = np.unique(first_told(graph), return_inverse=True)
-    if len(rows) < len(which):
-        before = known and (known[0].of_factors(rows), known[1])
-        judgement, poses = robust_solve(graph.subset(rows), report, check, before)
-        return judgement.of_factors(which), poses
     first = growth = Growth(graph, check)
     last = so_far(first), first.poses
     number = 0

@@ -58,6 +58,19 @@ def test_a_clean_graph_keeps_all_its_loops(world):
     assert not found.doubts
 
 
+def test_noise_overstated_alike_is_no_reason_to_doubt_what_does_not_fit():
+    """As where each information is the identity: what misses by centimetres still fits it."""
+    world = careful_world(300, 420)
+    graph = spoilt(world, 'grouped', 100).graph
+    every = np.arange(len(graph.between))
+    once, poses = robust_solve(graph)
+    found, again = robust_solve(graph.subset(every, np.full(len(every), 1e4)))
+    assert (found.accepted == once.accepted).all() and not found.suspect.any()
+    np.testing.assert_allclose(found.variance * 1e4, once.variance, rtol=0.01)
+    np.testing.assert_allclose(found.sigmas, once.sigmas, rtol=0.1, atol=1e-9)
+    assert not found.doubts and position_error(again, poses) < 1e-3
+
+
 @pytest.mark.parametrize('backwards', [False, True])
 def test_a_loop_told_twice_is_no_witness_of_itself(world, backwards):
     bad = slipped(spoilt(world, 'grouped', 170).graph, 200, (1.0, 0.0, 0.0))
