@@ -88,8 +88,7 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
     measure_by(free_memory)
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome, sentences = settled(_outcome(arguments, record, asked))
-    if made:
-        outcome = _with_parts_doubted(record.graph, outcome)
+    outcome = with_parts_doubted(record.graph, outcome, always=made is not None)
     remarks = [*_remarks(outcome), *sentences,
                *offset_sentence(record.graph.manifold, outcome.offset)]
     warn(remarks, arguments.quiet)
@@ -126,19 +125,25 @@ def _read(arguments: argparse.Namespace) -> tuple[GraphRecord, 'ScanMap | None']
     return made.record, made
 
 
-def _with_parts_doubted(graph: FactorGraph, outcome: Outcome) -> Outcome:
+def with_parts_doubted(graph: FactorGraph, outcome: Outcome, always: bool) -> Outcome:
     """
-    Return the outcome of a drive past scans, doubted if its map is in several parts.
+    Return the outcome, doubted if its map is in several parts that loops would join.
 
-    A graph may be of several sessions, which need not meet. In a drive, the place of a part that
-    no accepted loop joins is where the front end lost its way, and a guess.
+    The place of a part that no accepted loop joins is a guess. A graph may be of several sessions,
+    which need not meet: without a loop between them there is nothing to settle.
+
+    always : without such loops, too: in a drive past scans the front end lost its way there, and
+    to merge is to join
     """
     judgement = outcome.judgement
-    if judgement is None or outcome.parts == 1:
+    if judgement is None or outcome.parts == 1 or any(
+            doubt.kind == PARTS for doubt in judgement.doubts):
         return outcome
     part = part_labels(graph.subset(judgement.accepted))
-    doubts = *judgement.doubts, doubt_of_parts(graph.between, part)
-    return replace(outcome, judgement=replace(judgement, doubts=doubts))
+    doubt = doubt_of_parts(graph.between, part)
+    if not (always or doubt.loops):
+        return outcome
+    return replace(outcome, judgement=replace(judgement, doubts=(*judgement.doubts, doubt)))
 
 
 def _remarks(outcome: Outcome) -> Iterator[str]:

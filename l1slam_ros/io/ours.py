@@ -26,7 +26,7 @@ from itertools import chain
 from pathlib import Path
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.io.files import reported
+from l1slam_ros.io.files import other_kind, reported
 from l1slam_ros.io.remarks import KEYWORD
 
 PROGRAM = 'l1slam_ros'
@@ -77,6 +77,12 @@ def is_ours(path: str | os.PathLike[str]) -> bool:
                    for begin, mark in _PICTURES.items()))
 
 
+def _holds(folder: str | os.PathLike[str], path: str) -> bool:
+    """Tell whether `path` is the folder or lies in it."""
+    inside = Path(os.path.realpath(path))
+    return Path(os.path.realpath(folder)) in (inside, *inside.parents)
+
+
 def _ends(path: str | os.PathLike[str]) -> tuple[bytes, bytes]:
     with open(path, 'rb') as file:
         first = file.read(_ENOUGH)
@@ -99,13 +105,19 @@ def refuse_others(outputs: Iterable[str | os.PathLike[str]],
 
     Raises
     ------
-    FileError : naming the first such output.
+    FileError : naming the first such output, or one that is neither a file nor a folder, or the
+        folder in which this runs: that would move away with all that is in it.
 
     """
     read = [path for path in inputs if os.path.exists(path)]
     for output in outputs:
         if not os.path.lexists(output):
             continue
+        if os.path.isdir(output) and _holds(output, os.getcwd()):
+            raise FileError(output, 'is the folder in which this runs, or holds it; expected '
+                            'another name')
+        if (kind := other_kind(output)) and not os.path.isdir(output):
+            raise FileError(output, f'cannot be written: it is {kind}')
         for path in read:
             if _is_part(output, path):
                 raise FileError(output, f'is an input, {path}, and inputs are never replaced; '

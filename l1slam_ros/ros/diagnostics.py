@@ -163,6 +163,7 @@ class Diagnostics:
         if failing := self._failures.sentence:
             return DiagnosticStatus.ERROR, failing
         wrong = [twins] if twins else []
+        wrong += filter(None, (traffic.unheard() for traffic in self._topics.values()))
         for name, traffic in self._topics.items():
             if name.endswith('odom') and (sources := traffic.publishers()) > 1:
                 wrong.append(f'{name} has {sources} publishers; expected one')

@@ -273,6 +273,13 @@ def test_a_page_replaces_a_page_and_nothing_of_others(capsys, tmp_path):
         err = run(capsys, 'solve', path, '--report', tmp_path / name, code=2)[1]
         assert err.endswith('is not the name of a web page; expected one that ends in .html or '
                             '.htm\n')
+    for place in 'none', 'folder.html':
+        (tmp_path / 'folder.html').mkdir(exist_ok=True)
+        where = tmp_path / place if place.endswith('.html') else tmp_path / place / 'map.html'
+        err = run(capsys, 'solve', path, '--report', where, '--output', tmp_path / 'map.g2o',
+                  '--force', code=2)[1]
+        assert f'{where}: cannot be written' in err and err.count('\n') == 1
+        assert not (tmp_path / 'map.g2o').exists()
     link = tmp_path / 'graph.g2o'
     link.symlink_to(page)
     assert 'is an input' in run(capsys, 'solve', link, '--report', page, '--force', code=2)[1]

@@ -116,6 +116,23 @@ def test_a_graph_of_a_user_stays_as_it_is(capsys, users, tmp_path, lies):
     assert users.read_bytes() != before
 
 
+def test_the_folder_one_stands_in_stays_where_it_is(capsys, users, tmp_path, monkeypatch):
+    # As `--output "$OUT" --force` names it where OUT is not set.
+    here = tmp_path / 'here' / 'work'
+    here.mkdir(parents=True)
+    (here / 'notes.txt').write_text('mine')
+    monkeypatch.chdir(here)
+    for output in '', '.', '..', here.parent:
+        for command in (('convert', users), ('solve', users, '--output')):
+            err = run(capsys, *command, output, '--force', code=2)[1]
+            assert 'is the folder in which this runs' in err and err.count('\n') == 1
+    assert os.listdir(here) == ['notes.txt'] and os.listdir(tmp_path / 'here') == ['work']
+    os.mkfifo('pipe')
+    err = run(capsys, 'convert', users, 'pipe', '--force', code=2)[1]
+    assert 'cannot be written: it is not a regular file' in err
+    assert sorted(os.listdir(here)) == ['notes.txt', 'pipe']
+
+
 def test_an_empty_file_of_a_user_stays_empty(capsys, users, tmp_path):
     for name in 'map.g2o', 'map.tum', 'map.png':
         output = tmp_path / name

@@ -19,9 +19,10 @@ pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Odometry
 from node_bench import call, odometry
 from rcl_interfaces.srv import DescribeParameters, ListParameters
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy, qos_profile_sensor_data
 from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.io.graphs.saved_map import load_map
@@ -247,6 +248,20 @@ def test_a_node_that_is_managed_does_as_it_is_told(bench, tmp_path):
 
 def test_unless_it_is_managed_it_is_active_at_once(bench):
     assert state(bench()) == 'active'
+
+
+def test_publishers_that_cannot_be_heard_are_noticed(bench):
+    """The drivers of many robots publish odometry best effort; the node would wait for ever."""
+    b = bench()
+    b.until(lambda: b.status()[1] == 'ok', 'all is fine')
+    deaf = b.peer.create_publisher(Odometry, '/odom', qos_profile_sensor_data)
+    b.until(lambda: b.status()[1] == (
+        '1 of the publishers of /odom cannot be heard: best effort publisher and reliable '
+        'subscription; expected the same QoS, or qos_overrides./odom.subscription.reliability: '
+        'best_effort'), 'it is said')
+    assert b.status()[0] == DiagnosticStatus.WARN
+    b.peer.destroy_publisher(deaf)
+    b.until(lambda: b.status()[1] == 'ok', 'it is gone')
 
 
 def test_two_nodes_of_one_name_are_noticed(bench):

@@ -25,7 +25,7 @@ from l1slam_ros.cli.report.content import content
 from l1slam_ros.cli.report.rivals import rival_maps
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
-from l1slam_ros.io.files import replacing
+from l1slam_ros.io.files import replacing, require_file
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.ours import REPORT_MARK, refuse_others
 from l1slam_ros.io.progress import Progress
@@ -40,7 +40,7 @@ def check_report(path: Path, read: Sequence[Path], force: bool) -> None:
 
     Raises
     ------
-    FileError : its name is no page's, or what is there is not ours or is read.
+    FileError : its name is no page's, its folder is none, or what is there is not ours or is read.
     OptionError : the plotting library is not installed.
 
     """
@@ -50,6 +50,7 @@ def check_report(path: Path, read: Sequence[Path], force: bool) -> None:
     if find_spec('plotly') is None:
         raise OptionError('--report draws with plotly, which is not installed; expected it: `pip '
                           "install 'l1slam_ros[report]'`, or the package python3-plotly")
+    require_file(path)
     refuse_others([path], read, force)
 
 

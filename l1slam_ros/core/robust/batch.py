@@ -64,6 +64,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
+from l1slam_ros.core.robust.as_measured import Believed, OnRound, as_measured
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
 from l1slam_ros.core.robust.innovation import (
     BY_CHANCE,
@@ -99,12 +100,8 @@ _MOST_ROUNDS = 200
 # What a factorisation, or numbers beyond double precision, end in.
 _FAILURES = (GraphError, np.linalg.LinAlgError)
 
-# From the round and the loops accepted so far.
-OnRound = Callable[[int, int], None]
-# A judgement, and the map (n, p) of what it accepts.
-Believed = tuple[Judgement, Array]
 
-
+@as_measured
 def robust_solve(
     graph: FactorGraph, report: OnRound = lambda round_, accepted: None,
     check: Callable[[], None] = lambda: None, known: Believed | None = None,

@@ -26,7 +26,8 @@ from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.parts import bridged, odometry_gaps, part_labels
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SAME
-from l1slam_ros.core.robust.batch import OnRound, RobustMap, minimise_robustly
+from l1slam_ros.core.robust.as_measured import OnRound
+from l1slam_ros.core.robust.batch import RobustMap, minimise_robustly
 from l1slam_ros.core.robust.inspection import (
     FEWEST_SPARE,
     densest_part,

@@ -157,6 +157,13 @@ class Judgement:
                        suspect=spread(self.suspect, False), sigmas=spread(self.sigmas, np.nan),
                        noise=spread(self.noise, 1.0), slips=rows[self.slips[self.slips < k]])
 
+    def of_factors(self, which: Indices) -> 'Judgement':
+        """Return the judgement of some of the factors, (k,), or of some several times."""
+        slipped = np.isin(np.arange(len(self.accepted)), self.slips)
+        return replace(self, accepted=self.accepted[which], suspect=self.suspect[which],
+                       sigmas=self.sigmas[which], noise=self.noise[which],
+                       slips=np.flatnonzero(slipped[which]))
+
     def believed(self, graph: FactorGraph) -> FactorGraph:
         """Return the accepted factors of a graph, as noisy as they are."""
         straight = straightened(graph, self.drift)

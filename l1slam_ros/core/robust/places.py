@@ -29,8 +29,31 @@ from l1slam_ros.core.robust.innovation import BY_CHANCE
 # of so many ordinary steps, where keyframes are far apart; and what they claim, too.
 NEAR = 5.0
 _NEAR_STEPS = 10
+# [m, rad] What two loops of one pair of keyframes measure is the same to so much in a file that
+# gives one loop twice, or from either end, rounded; and hardly ever where they were measured.
+_SAME = 1e-4
 # Claims are told apart to this part of it, so that a robot that stands has few different ones.
 _GRAIN = 0.1
+
+
+def first_told(graph: FactorGraph) -> Indices:
+    """
+    Return for each factor the first that says the same of the same keyframes, (m,), mostly itself.
+
+    Front ends write a loop twice, or from either end. It was measured once, and is no witness of
+    itself. What is odometry, absolute or vouched for stands for itself.
+    """
+    factors, first = graph.between, np.arange(len(graph.between))
+    low, high, Z = ends_in_time(graph)
+    left = np.flatnonzero(~factors.is_odometry & ~factors.is_absolute & ~factors.trusted)
+    while len(left):
+        _, at, pair = np.unique(pair_key(low[left], high[left], graph.n_poses),
+                                return_index=True, return_inverse=True)
+        one = left[at[pair]]
+        same = (abs(graph.manifold.local(Z[one], Z[left])) < _SAME).all(axis=1)
+        first[left[same]] = one[same]
+        left = left[~same]
+    return first
 
 
 def err_together(place: Indices, residual: Array, drawn: Array) -> bool:

@@ -49,6 +49,7 @@ from l1slam_ros.io.graphs.rows import (
     made_definite,
     manifold_of,
     rows_of,
+    turning_too_far,
     vertices_of,
     without_circles,
 )
@@ -130,6 +131,7 @@ def read_one_of_several(path: str | os.PathLike[str],
     edges, circles = without_circles(
         rows_of(path, groups, manifold, FACTORS, rotation_information))
     edges, indefinite = made_definite(edges)
+    said = *circles, *indefinite, *turning_too_far(edges, manifold)
     if edges.alone.all():
         raise FileError(path, f'no edges; expected {expected_tags("between")} lines')
     vertices = vertices_of(path, groups, manifold)
@@ -151,7 +153,7 @@ def read_one_of_several(path: str | os.PathLike[str],
         stand[used], [number for number, _ in lines.comments])].tolist()
     record = GraphRecord(
         graph, vertices.pose if len(vertices) else None, ids, _stamps(path, ids, remarks),
-        (*circles, *indefinite, *_skipped(groups, ids, anchors)),
+        (*said, *_skipped(groups, ids, anchors)),
         rotation_information=rotation_information, remarks=remarks, left_out=left_out,
         comments=tuple(zip(before, (text for _, text in lines.comments), strict=True)))
     return record, beyond

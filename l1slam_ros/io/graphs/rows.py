@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lines of a graph file as arrays; errors name the malformed line."""
 
+import math
 import os
 from dataclasses import dataclass, fields, replace
 
@@ -201,6 +202,18 @@ def without_circles(edges: Rows) -> tuple[Rows, list[str]]:
     sentence = (f'{counted(len(lines), "edge")} from a vertex to itself not used: '
                 f'{"line" if len(lines) == 1 else "lines"} {", ".join(names)}')
     return edges.chosen(~circle), [sentence]
+
+
+def turning_too_far(edges: Rows, manifold: Manifold) -> list[str]:
+    """Return a sentence if edges in the plane turn by more than a full turn, as in degrees."""
+    turns = abs(edges.pose[:, 2]) if manifold is se2 else np.zeros(len(edges))
+    count = int(np.count_nonzero(turns > 2 * math.pi))
+    if not count:
+        return []
+    most = int(np.argmax(turns))
+    return [f'{count:,} of {counted(len(edges), "edge")} turn{"s" * (count == 1)} by more than '
+            f'2 pi, the most by {turns[most]:.4g} at line {edges.lines[most]:,}: all angles are '
+            'read as radians; are these degrees?']
 
 
 def made_definite(edges: Rows) -> tuple[Rows, list[str]]:

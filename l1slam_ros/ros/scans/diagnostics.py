@@ -73,7 +73,7 @@ class ScanDiagnostics:
         """Return the level, and a sentence with all that is wrong now."""
         if failing := self._failures.sentence:
             return DiagnosticStatus.ERROR, failing
-        wrong = []
+        wrong = [*filter(None, (traffic.unheard() for traffic in self._topics.values()))]
         if lately:
             wrong.append('messages not used in the last minute: ' + ', '.join(
                 f'{count} {_SAID.get(cause, cause)}' for cause, count in sorted(lately.items())))

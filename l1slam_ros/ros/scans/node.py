@@ -13,6 +13,7 @@ One thread receives messages, one does all the work, scans first, and one writes
 service asks for it.
 """
 
+from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -35,7 +36,7 @@ from l1slam_ros.ros.scans.map_drawer import MapDrawer
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
 from l1slam_ros.ros.scans.publishing import ScanPublisher
 from l1slam_ros.ros.threads.failures import Failures, reason
-from l1slam_ros.ros.threads.intake import Traffic
+from l1slam_ros.ros.threads.intake import Traffic, unheard_by
 from l1slam_ros.ros.threads.job_queue import JobQueue
 
 try:
@@ -129,7 +130,8 @@ class ScanLoopsNode(Node):
                 qos_overriding_options=QoSOverridingOptions.with_default_policies())
         except Exception as error:  # by what is said of its QoS, rclpy raises anything
             raise OptionError(f'{topic} cannot be subscribed to: {reason(error)}') from error
-        traffic = self._traffic[topic] = Traffic(subscription.get_publisher_count)
+        traffic = self._traffic[topic] = Traffic(
+            subscription.get_publisher_count, partial(unheard_by, self, subscription))
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         wrong = [parameter.name for parameter in parameters

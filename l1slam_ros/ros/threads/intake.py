@@ -24,6 +24,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from functools import partial
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -31,7 +32,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from l1slam_ros.core.errors import OptionError
@@ -60,6 +61,7 @@ class Traffic:
     Parameters
     ----------
     publishers : returns how many there are now
+    unheard : returns a sentence if there are others, whose messages do not come; see `unheard_by`
 
     Attributes
     ----------
@@ -70,11 +72,11 @@ class Traffic:
 
     """
 
-    def __init__(self, publishers: Callable[[], int]):
+    def __init__(self, publishers: Callable[[], int], unheard: Callable[[], str] = str):
         self.received = self.lost = 0
         self.last: dict[str, str] = {}
         self.other_source = False
-        self.publishers = publishers
+        self.publishers, self.unheard = publishers, unheard
         # The last number of each publisher, of who spoke last in front.
         self._numbers: list[int] = []
         self._marks = deque([(time.monotonic(), 0)])
@@ -113,6 +115,20 @@ class Traffic:
         self.last = {
             'received': str(self.received), 'rate': f'{rate:.1f}', 'lost': str(self.lost)}
         return self.last
+
+
+def unheard_by(node: Node, subscription: Any) -> str:
+    """Return a sentence if a topic has publishers whose QoS a subscription does not take."""
+    name = subscription.topic_name
+    if node.count_publishers(name) <= subscription.get_publisher_count():
+        return ''
+    reasons = [why for why in (
+        qos_check_compatible(publisher.qos_profile, subscription.qos_profile)
+        for publisher in node.get_publishers_info_by_topic(name))
+        if why[0] == QoSCompatibility.ERROR]
+    return (f'{len(reasons)} of the publishers of {name} cannot be heard: '
+            f'{reasons[0][1].removeprefix("ERROR: ").rstrip(";").lower()}; expected the same QoS, '
+            f'or qos_overrides.{name}.subscription.reliability: best_effort') if reasons else ''
 
 
 class _Apart(ReentrantCallbackGroup):  # type: ignore[misc]
@@ -184,7 +200,8 @@ class Intake:
             if not self._node.context.ok():  # a signal has shut ROS down just now
                 raise
             raise OptionError(f'{name} cannot be subscribed to: {reason(error)}') from error
-        traffic = Traffic(subscription.get_publisher_count)
+        traffic = Traffic(subscription.get_publisher_count,
+                          partial(unheard_by, self._node, subscription))
         self._topics.append(_Topic(name, subscription, traffic, use))
         self.traffic[name] = traffic
 

@@ -58,6 +58,38 @@ def test_a_clean_graph_keeps_all_its_loops(world):
     assert not found.doubts
 
 
+def test_noise_overstated_alike_is_no_reason_to_doubt_what_does_not_fit():
+    """As where each information is the identity: what misses by centimetres still fits it."""
+    world = careful_world(300, 420)
+    graph = spoilt(world, 'grouped', 100).graph
+    every = np.arange(len(graph.between))
+    once, poses = robust_solve(graph)
+    found, again = robust_solve(graph.subset(every, np.full(len(every), 1e4)))
+    assert (found.accepted == once.accepted).all() and not found.suspect.any()
+    np.testing.assert_allclose(found.variance * 1e4, once.variance, rtol=0.01)
+    np.testing.assert_allclose(found.sigmas, once.sigmas, rtol=0.1, atol=1e-9)
+    assert not found.doubts and position_error(again, poses) < 1e-3
+
+
+@pytest.mark.parametrize('backwards', [False, True])
+def test_a_loop_told_twice_is_no_witness_of_itself(world, backwards):
+    bad = slipped(spoilt(world, 'grouped', 170).graph, 200, (1.0, 0.0, 0.0))
+    loops = ~bad.between.is_odometry
+    twice, told = bad.subset(np.arange(len(loops))), turned(bad, loops) if backwards else bad
+    factors = told.between
+    # As files tell it: rounded.
+    twice.append_between(factors.i[loops], factors.j[loops], factors.measurement[loops].round(5),
+                         factors.sqrt_information[loops], factors.trusted[loops],
+                         factors.struck[loops])
+    once, poses = robust_solve(bad)
+    found, again = robust_solve(twice)
+    assert (found.accepted == np.r_[once.accepted, once.accepted[loops]]).all()
+    assert (found.suspect == np.r_[once.suspect, once.suspect[loops]]).all()
+    assert found.doubts == once.doubts and found.confidence == once.confidence
+    assert found.slips.tolist() == once.slips.tolist() != []
+    np.testing.assert_array_equal(again, poses)
+
+
 def test_a_graph_of_odometry_alone_is_its_chain(world):
     found, poses = robust_solve(world.graph.subset(world.graph.between.is_odometry))
     assert position_error(poses, world.odometry) < 1e-6

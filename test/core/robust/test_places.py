@@ -16,7 +16,13 @@ from lies import careful_world
 from problems import chain_of, graph_of, measure, straight
 
 from l1slam_ros.core.graph.factor_graph import lowest_of_components
-from l1slam_ros.core.robust.places import beside_refused, join_what_no_other, mates, places
+from l1slam_ros.core.robust.places import (
+    beside_refused,
+    first_told,
+    join_what_no_other,
+    mates,
+    places,
+)
 
 
 def corridor(step, pairs, off):
@@ -44,6 +50,18 @@ def test_a_run_is_one_place_and_what_claims_something_else_is_another():
     graph, chain = corridor(1.0, pairs, off)
     place = places(graph, chain)[0][-51:]
     assert len(set(place[:50].tolist())) == 1 and place[50] not in place[:50]
+
+
+def test_the_same_told_twice_is_told_first_and_another_measurement_is_not():
+    pairs = [(0, 9), (0, 9), (9, 0), (0, 9), (0, 9), (0, 8)]
+    graph = graph_of(straight(10, 1.0), chain_of(10), 0.0, np.eye(3))
+    turn = [0.0, 0.0, 3.1415926]
+    for pair, Z in zip(pairs, [[9, 0, 0], [9, 0, 2e-4], [-9, 0, 0], [9, 0, 0.00021], turn, turn],
+                       strict=True):
+        graph.add_between(*np.array([pair]).T, np.array([Z], float), np.eye(3)[None])
+    graph.add_between([0], [9], np.array([[0.0, 0.0, -3.1415926]]), np.eye(3)[None])
+    assert first_told(graph)[9:].tolist() == [9, 10, 9, 10, 13, 14, 13]
+    assert first_told(graph)[:9].tolist() == list(range(9))
 
 
 def test_every_loop_of_a_world_has_a_place():

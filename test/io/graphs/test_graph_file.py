@@ -177,6 +177,17 @@ def test_many_matrices_that_are_not_definite_are_one_line_and_the_worst_is_named
                                'line 10: its smallest eigenvalue is -0.8 times its largest; ')
 
 
+def test_turns_beyond_a_full_turn_are_said_to_look_like_degrees(write):
+    near = 'EDGE_SE2 3 7 1 0.25 6.28 1 0 0 1 0 1\n'
+    assert not read_graph_file(write(SQUARE + near)).skipped
+    bad = near + 'EDGE_SE2 3 7 1 0.25 7 1 0 0 1 0 1\nEDGE_SE2 9 3 -0.5 1 -171.9 1 0 0 1 0 1\n'
+    assert read_graph_file(write(SQUARE + bad)).skipped == (
+        '2 of 6 edges turn by more than 2 pi, the most by 171.9 at line 11: all angles are read '
+        'as radians; are these degrees?',)
+    sentence, = read_graph_file(write(SQUARE + bad.splitlines()[1])).skipped
+    assert sentence.startswith('1 of 4 edges turns by more than 2 pi, the most by 7 at line 9: ')
+
+
 @pytest.mark.parametrize(('content', 'message'), [
     ('', ': the file is empty; expected EDGE_SE2, EDGE2, EDGE_SE3:QUAT or EDGE3 lines'),
     ('# nothing\n\n', ': the file is empty; expected EDGE_SE2, '),
