@@ -333,10 +333,8 @@ def test_the_commands_of_a_page_run_in_their_order(page, tmp_path, shorter):
                 nodes.append(backend(command, tmp_path, environment))
                 nodes[-1].__enter__()
             else:
-                # The best map of a graph with lies that nobody vouches for may be doubtful; so
-                # is one of drives that nothing joins, as its page says.
-                run(command, tmp_path, environment, (0, 4) if 'lies' in command else
-                    (4,) if command.startswith('l1slam merge') else (0,))
+                # The best map of a graph with lies that nobody vouches for may be doubtful.
+                run(command, tmp_path, environment, (0, 4) if 'lies' in command else (0,))
     for node in nodes:
         node.__exit__(None, None, None)
 

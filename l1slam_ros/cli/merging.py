@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from l1slam_ros.cli.commands import Ending, inputs, read, scan_progress
-from l1slam_ros.cli.solving import asked_of, solved, with_parts_doubted
+from l1slam_ros.cli.solving import asked_of, solved
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.robust.batch_map import Outcome
 from l1slam_ros.fleet.merging import Merged, Part, apart_sentences, merged, parts_beside
@@ -66,7 +66,6 @@ def _part(arguments: argparse.Namespace, path: Path) -> Part:
 def _settled(outcome: Outcome, whole: Merged, paths: list[Path]) -> tuple[Outcome, list[str]]:
     """Return the outcome with unjoined parts beside each other, and a sentence on each."""
     graph = whole.record.graph.without_struck()
-    outcome = with_parts_doubted(whole.record.graph, outcome, always=True)
     judgement = outcome.judgement
     if judgement:
         rivals = rival_doubts(whole.record.graph, outcome.solution.poses, judgement.accepted,

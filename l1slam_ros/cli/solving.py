@@ -88,7 +88,8 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
     measure_by(free_memory)
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome, sentences = settled(_outcome(arguments, record, asked))
-    outcome = with_parts_doubted(record.graph, outcome, always=made is not None)
+    if made:
+        outcome = _with_parts_doubted(record.graph, outcome)
     remarks = [*_remarks(outcome), *sentences,
                *offset_sentence(record.graph.manifold, outcome.offset)]
     warn(remarks, arguments.quiet)
@@ -125,25 +126,19 @@ def _read(arguments: argparse.Namespace) -> tuple[GraphRecord, 'ScanMap | None']
     return made.record, made
 
 
-def with_parts_doubted(graph: FactorGraph, outcome: Outcome, always: bool) -> Outcome:
+def _with_parts_doubted(graph: FactorGraph, outcome: Outcome) -> Outcome:
     """
-    Return the outcome, doubted if its map is in several parts that loops would join.
+    Return the outcome of a drive past scans, doubted if its map is in several parts.
 
-    The place of a part that no accepted loop joins is a guess. A graph may be of several sessions,
-    which need not meet: without a loop between them there is nothing to settle.
-
-    always : without such loops, too: in a drive past scans the front end lost its way there, and
-    to merge is to join
+    A graph may be of several sessions, which need not meet. In a drive, the place of a part that
+    no accepted loop joins is where the front end lost its way, and a guess.
     """
     judgement = outcome.judgement
-    if judgement is None or outcome.parts == 1 or any(
-            doubt.kind == PARTS for doubt in judgement.doubts):
+    if judgement is None or outcome.parts == 1:
         return outcome
     part = part_labels(graph.subset(judgement.accepted))
-    doubt = doubt_of_parts(graph.between, part)
-    if not (always or doubt.loops):
-        return outcome
-    return replace(outcome, judgement=replace(judgement, doubts=(*judgement.doubts, doubt)))
+    doubts = *judgement.doubts, doubt_of_parts(graph.between, part)
+    return replace(outcome, judgement=replace(judgement, doubts=doubts))
 
 
 def _remarks(outcome: Outcome) -> Iterator[str]:

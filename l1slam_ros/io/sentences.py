@@ -78,7 +78,7 @@ _REASONS = {
     UNSOLVED: 'solving for the {loops} accepted loops failed ({detail}): this is the map by which '
               'they were judged',
     PARTS: 'no accepted loop joins {detail} parts of the map, {where}, so their relative poses '
-           'are guesses; loops between them that are left out: {loops}',
+           'are guesses; {loops} loops between them are left out',
 }
 _REMEDY = 'Vouch for a true loop, strike out a false one, or state the right noise'
 
