@@ -101,8 +101,8 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     """
     Yield the loops of one place, accepted or not, that alone say how two parts lie to each other.
 
-    Parts are what is between two gaps, or slips that were cut. Where slips alone were cut, none are
-    asked for: a lie hardly has the robot move there as elsewhere.
+    Parts are what is between two gaps, or slips that were cut. Of slips alone nobody asks: a lie
+    hardly has the robot move there as elsewhere.
     """
     given = growth.given
     sure = ~given.is_loop | given.trusted | given.factors.is_absolute

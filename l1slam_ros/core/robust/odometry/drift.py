@@ -138,8 +138,9 @@ class Straight:
 
 def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
     """
-    Return the likeliest of some drifts, by how much more a rival drifts [rad/m], or 0, and ln of
-    the odds of the one against all its rivals.
+    Return the likeliest of some drifts, by how much more a rival drifts, and ln of its odds.
+
+    The rival is 0 [rad/m] where there is none; the odds are those against all rivals together.
 
     The first one is that without a drift. Where it explains loops, too, another has to be likelier
     by one loop of each place, and by what two places are worth with the others of these, which
