@@ -32,7 +32,7 @@ LINES = "[document.getElementById('trusted').value, document.getElementById('str
 
 
 def ring(path, loops=7, n=600):
-    """Write a drive round a ring whose loops are all of one place, 1.2 m long, and its odometry."""
+    """Write a drive round a ring whose loops are all of one place, 1.2 m long: no run."""
     angle = 2 * np.pi * np.arange(n + loops) / n
     truth = np.column_stack((20 * np.cos(angle), 20 * np.sin(angle), angle))
     chain, back = chain_of(n + loops), np.arange(loops)

@@ -154,21 +154,23 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
     values = np.array([straight.log_evidence + straight.stretches * (straight.log_room - widest)
                        for straight in some])
     sure = TWO_PLACES * some[0].told.given.log_odds_of_place
-    if len(some[0].loops):
-        fits, count = np.array([straight.fits(some[0].loops) for straight in some]).T
+    stated = len(some[0].loops) > 0
+    first = 0 if stated else int(np.argmax(values))
+    fits, count = np.array([straight.fits(some[first].loops) for straight in some]).T
+    fitting = values + fits - count * fits[first] / max(count[first], 1)
+    if stated:
         noise = np.array([straight.told.noise.variance[0] for straight in some])
-        is_none = (values < values[0]) | (noise > noise[0])
-        values += fits - count * fits[0] / max(count[0], 1)
-        values[is_none] = -np.inf
-        values[0] += sure
-    first = int(np.argmax(values))
-    best = some[first]
-    less, more = np.array([(values[first] - value, other.drift - best.drift)
-                           for other, value in zip(some[1:], values[1:], strict=True)
-                           if other.drift != best.drift and len(other.loops)]).reshape(-1, 2).T
-    if best is some[0] or not (less < sure).any():
-        return best, 0.0, np.inf
-    return best, float(more[np.argmin(less)]), -float(np.logaddexp.reduce(-less))
+        fitting[(values < values[0]) | (noise > noise[0])] = -np.inf
+        fitting[0] += sure
+        values, first = fitting, int(np.argmax(fitting))
+    # Either way a rival is less likely by no more than two places are worth.
+    less = values[first] - values
+    rivals = [(less[k], other.drift - some[first].drift) for k, other in enumerate(some)
+              if max(less[k], fitting[first] - fitting[k]) < sure
+              and k and len(other.loops) and other.drift != some[first].drift]
+    if not first or not rivals:
+        return some[first], 0.0, np.inf
+    return some[first], min(rivals)[1], -float(np.logaddexp.reduce([-less for less, _ in rivals]))
 
 
 def _places(known: Growth, growth: Growth) -> int:
