@@ -31,13 +31,13 @@ PRESS = """const press = text => [...document.querySelectorAll('button')].find(
 LINES = "[document.getElementById('trusted').value, document.getElementById('struck').value]"
 
 
-def ring(path, loops=20, n=600):
-    """Write a drive round a ring whose loops are all of one place, far off by its odometry."""
+def ring(path, loops=7, n=600):
+    """Write a drive round a ring whose loops are all of one place, 1.2 m long: no run."""
     angle = 2 * np.pi * np.arange(n + loops) / n
-    truth = np.column_stack((95 * np.cos(angle), 95 * np.sin(angle), angle))
+    truth = np.column_stack((20 * np.cos(angle), 20 * np.sin(angle), angle))
     chain, back = chain_of(n + loops), np.arange(loops)
     pairs = np.concatenate((chain, np.column_stack((back + n, back))))
-    noise = np.random.default_rng(1).standard_normal((len(pairs), 3)) * [0.05, 0.05, 0.005]
+    noise = np.random.default_rng(2).standard_normal((len(pairs), 3)) * [0.05, 0.05, 0.005]
     graph = graph_of(truth, pairs, noise, np.diag([400.0, 400.0, 4e4]))
     write_graph_file(path, GraphRecord(graph, odometry_poses(graph), 7 + np.arange(n + loops)))
     return path

@@ -129,7 +129,7 @@ def robust_solve(
             last = so_far(growth, repair.drift), growth.poses
             report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
         reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival)
-        return judgement_of(growth, reasons, drift=repair.drift), growth.poses
+        return judgement_of(growth, reasons, drift=repair.drift, odds=repair.odds), growth.poses
     except _FAILURES as error:
         judgement, poses = known or last
         return judgement.broken_off(graph, error), poses
@@ -139,7 +139,8 @@ class _Repair:
     """
     What loops that are left out may be right by.
 
-    drift : that of the odometry [rad/m]; rival : by how much more it may be.
+    drift : that of the odometry [rad/m]; rival : by how much more it may be; odds : ln of those of
+    the one against all its rivals.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None]):
@@ -147,6 +148,7 @@ class _Repair:
         self._check = check
         self._asked = False
         self.drift = self.rival = 0.0
+        self.odds = np.inf
 
     def __call__(self, found: Growth, as_stated: Growth) -> Growth | None:
         """Return a state without a drift, asked once, or without a slip; None: there is none."""
@@ -162,7 +164,8 @@ class _Repair:
         if drifts:
             some = [stated, *(end for drift in drifts for end in self._without(drift))]
             begun = None if len(stated.loops) else with_runs(found)
-            best, self.rival = likeliest(some + (self._ends(0.0, begun) if begun else []))
+            some += self._ends(0.0, begun) if begun else []
+            best, self.rival, self.odds = likeliest(some)
         taken = drift_taken_for_noise(as_stated) if best is stated else 0.0
         if taken:
             best = next((end for end in self._without(taken) if end.keeps_places(as_stated)), best)

@@ -231,8 +231,14 @@ def so_far(growth: Growth, drift: float = 0.0) -> Judgement:
 
 
 def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), settled: bool = True,
-                 drift: float = 0.0) -> Judgement:
-    """Return what a state says of the factors that were given."""
+                 drift: float = 0.0, odds: float = np.inf) -> Judgement:
+    """
+    Return what a state says of the factors that were given.
+
+    That another drift may be right is no reason where maps that looked like this one were right.
+
+    drift : that of the odometry [rad/m]; odds : ln of those of it against all others
+    """
     believed = so_far(growth, drift)
     square, suspect = fits(growth)
     given = growth.given
@@ -243,6 +249,10 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), settled: bool 
     terms = terms_of(bool((given.is_loop & growth.accepted).any()), unsure,
                      *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
     confidence = forecast(terms) if loops.any() else float('nan')
+    if odds < 0:
+        confidence = min(confidence, float(1 / (1 + np.exp(-odds))))
+    reasons = tuple(
+        doubt for doubt in reasons if doubt.kind != DRIFTS or not confidence >= CONFIDENT)
     left_out = np.flatnonzero(loops & ~believed.accepted)
     # Where all loops came in, what the file states may be vague; there is nothing to settle. Of
     # fewer loops than a run has nothing is recorded.

@@ -35,6 +35,7 @@ from l1slam_ros.core.robust.judgement import (
     doubt_of,
 )
 from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
+from l1slam_ros.core.robust.odometry.untold import LEAST
 from l1slam_ros.core.robust.pairwise_consistency import (
     RUN,
     agree_at_a_place,
@@ -63,7 +64,7 @@ def doubts(growth: Growth, ended: bool = True, rival: float = 0.0) -> tuple[Doub
         reasons.append(_doubt(growth, UNFINISHED, left_out))
     if _decides_alone(growth, accepted):
         reasons.append(_doubt(growth, ONE_PLACE, accepted))
-    if growth.cut.any():
+    if growth.given.gap.any():
         reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
     agree = _agree(growth)
     reasons += _other_map(growth, agree)
@@ -79,7 +80,8 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
     """
     Return whether all accepted loops are of one place, and may be one mistake.
 
-    As one loop, by the median of what they say, it would not be believed by odometry alone.
+    As one loop, by the median of what they say, it would not be believed by odometry alone. A run
+    hardly is a mistake: it only has to be likelier true than false.
     """
     given = growth.given
     if (len(accepted) < RUN or not given.may_err_as_one(accepted, TWO_PLACES)
@@ -91,15 +93,16 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
     within = accepted[~odometry.across()[accepted]]
     if not len(within):
         return False
-    return bool(np.median(odometry.innovations(within).log_ratio()) < SURE)
+    least = 0.0 if runs(growth, within) else SURE
+    return bool(np.median(odometry.innovations(within).log_ratio()) < least)
 
 
 def _joining_alone(growth: Growth) -> Iterator[Indices]:
     """
     Yield the loops of one place, accepted or not, that alone say how two parts lie to each other.
 
-    Parts are what is between two gaps, or slips that were cut. Of a slip, a run says enough: a lie
-    of many loops hardly has the robot move there as elsewhere.
+    Parts are what is between two gaps, or slips that were cut. Of slips alone nobody asks: a lie
+    hardly has the robot move there as elsewhere.
     """
     given = growth.given
     sure = ~given.is_loop | given.trusted | given.factors.is_absolute
@@ -118,8 +121,7 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
         if joined < without:
             # Rivals that say it otherwise are of the same doubt.
             joins |= own
-            if given.gap.any() or not runs(growth, rows[own]):
-                yield rows[own]
+            yield rows[own]
 
 
 def _joining_otherwise(growth: Growth) -> Iterator[Indices]:
@@ -177,11 +179,13 @@ def _may_have_slipped(growth: Growth, groups: list[Indices]) -> list[int]:
     Return the odometry factors that slipped, or not, neither of which is nearly sure.
 
     Of two slips each is unlikely by itself, since the other one bends what the loops across it
-    say. Refused loops that span a step and agree do so by chance as rarely as what is nearly sure.
+    say: so where one is cut, another one has to be nearly ruled out, and less so where none is.
+    Refused loops that span a step and agree do so by chance as rarely as what is nearly sure.
     """
     told = [step for group in groups for step in common_steps(growth, group)]
+    alone = -SURE if (growth.cut & ~growth.given.gap).any() else LEAST
     return [step for step, odds in growth.slip_odds.items()
-            if (odds < SURE if growth.cut[step] else odds > -SURE * (1 + (step in told)))]
+            if (odds < SURE if growth.cut[step] else odds > alone - SURE * (step in told))]
 
 
 def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:

@@ -15,7 +15,7 @@ from problems import chain_of, graph_of, retold
 
 from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
 from l1slam_ros.core.robust import batch_map
-from l1slam_ros.core.robust.judgement import DRIFTS
+from l1slam_ros.core.robust.forecast import forecast
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.worlds.false_loops import random_false_loops
@@ -31,7 +31,7 @@ def test_loops_agree_on_the_drift_that_there_is(drift):
     assert found == pytest.approx(drift, abs=2e-3)
 
 
-def test_laps_that_are_circles_fit_by_a_turn_more_on_each_so_that_the_map_is_doubtful(rng):
+def test_laps_that_are_circles_fit_by_a_turn_more_on_each_so_that_the_map_is_less_sure(rng):
     n = 300
     metres = 2 * np.pi * 48
     angle = 2 * np.pi * np.arange(2 * n) / n
@@ -43,7 +43,7 @@ def test_laps_that_are_circles_fit_by_a_turn_more_on_each_so_that_the_map_is_dou
     judgement = batch_map.solve(graph, None, batch_map.SolveOptions()).judgement
     turns = (judgement.drift - DRIFT) * metres / (2 * np.pi)
     assert turns == pytest.approx(round(turns), abs=0.1)
-    assert DRIFTS in {doubt.kind for doubt in judgement.doubts}
+    assert judgement.confidence < 0.95 < forecast(judgement.terms[:3])
 
 
 @pytest.mark.parametrize('seed', range(3))

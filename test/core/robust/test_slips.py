@@ -22,6 +22,7 @@ from l1slam_ros.core.robust.odometry import slips
 from l1slam_ros.core.robust.odometry.cuts import without
 from l1slam_ros.core.robust.odometry.motion import log_odds_of_slips, usual_motion
 from l1slam_ros.core.robust.odometry.slips import SURE, without_slip
+from l1slam_ros.core.robust.odometry.untold import LEAST
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.growth import Growth
 
@@ -127,14 +128,16 @@ def test_what_is_within_the_noise_as_stated_is_no_slip(bad, stated, turn, named)
     assert graph.between.i[slips].tolist() == named
 
 
-@pytest.mark.parametrize('turned, odds, doubted', [
-    (True, -SURE - 1, True), (True, -2 * SURE - 1, False),
-    (False, 1 - SURE, True), (False, -SURE - 1, False)])
-def test_refused_loops_that_agree_speak_for_a_slip_that_is_unlikely_by_itself(
-        bad, turned, odds, doubted):
+@pytest.mark.parametrize('turned, cut, odds, doubted', [
+    (True, False, 1 + LEAST - SURE, True), (True, False, LEAST - SURE - 1, False),
+    (False, False, 1 + LEAST, True), (False, False, LEAST - 1, False),
+    (False, True, 1 - SURE, True), (False, True, -SURE - 1, False)])
+def test_refused_loops_that_agree_and_a_cut_speak_for_a_slip_that_is_unlikely_by_itself(
+        bad, turned, cut, odds, doubted):
     """Of two slips each is, since the other one bends what the loops across it say."""
     growth = grown(slipped(bad.graph, STEP, TURN) if turned else bad.graph)
     (step,) = np.flatnonzero(~growth.given.is_loop & (growth.given.low == STEP))
+    growth.cut[step - 1] = cut
     growth.slip_odds = {int(step): odds}
     assert (SLIP in [doubt.kind for doubt in doubts(growth)]) == doubted
 

@@ -100,17 +100,13 @@ class Straight:
             _log_likelihood(growth, self._one_each) + len(self._one_each) * self.log_room
             - alone * np.log(len(growth.given.factors)) - ((self.drift / USUAL)**2 + known) / 2)
 
-    def fits(self, loops: Indices, as_found: bool) -> tuple[float, int]:
-        """
-        Return the ln of how likely the others of its places are among some, and their count.
-
-        as_found : by the noise as it was found
-        """
+    def fits(self, loops: Indices) -> tuple[float, int]:
+        """Return the ln of how likely the others of its places are among some, and their count."""
         others = np.setdiff1d(np.intersect1d(loops, self.loops), self._one_each)
         if not len(others):
             return 0.0, 0
         growth = self.told.copy()
-        growth.noise = replace(growth.noise, at_their_word=not as_found)
+        growth.noise = replace(growth.noise, at_their_word=False)
         both = np.union1d(others, self._one_each)
         return (_log_likelihood(growth, both) - _log_likelihood(growth, self._one_each),
                 len(others))
@@ -140,17 +136,19 @@ class Straight:
         return np.asarray(np.flatnonzero(self.told.accepted & self.told.given.is_loop))
 
 
-def likeliest(some: list[Straight]) -> tuple[Straight, float]:
+def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
     """
-    Return the likeliest of some drifts, and by how much more a rival drifts [rad/m], or 0.
+    Return the likeliest of some drifts, by how much more a rival drifts, and ln of its odds.
+
+    The rival is 0 [rad/m] where there is none; the odds are those against all rivals together.
 
     The first one is that without a drift. Where it explains loops, too, another has to be likelier
-    by what two places are worth, and to leave the odometry no noisier, as it would be if lies
+    by one loop of each place, and by what two places are worth with the others of these, which
+    agree, be it a mistake or not; and to leave the odometry no noisier, as it would be if lies
     came in by chance.
 
-    The other loops of a place agree, be it a mistake or not: they tell how noisy those are that
-    fit without. But the longer a place is, the larger is the map: on a smaller one there would be
-    more such places than loops were found at.
+    The longer a place is, the larger is the map: on a smaller one there would be more such places
+    than loops were found at.
     """
     widest = max(straight.log_room for straight in some)
     values = np.array([straight.log_evidence + straight.stretches * (straight.log_room - widest)
@@ -158,18 +156,21 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float]:
     sure = TWO_PLACES * some[0].told.given.log_odds_of_place
     stated = len(some[0].loops) > 0
     first = 0 if stated else int(np.argmax(values))
-    fits, count = np.array([straight.fits(some[first].loops, stated) for straight in some]).T
+    fits, count = np.array([straight.fits(some[first].loops) for straight in some]).T
     fitting = values + fits - count * fits[first] / max(count[first], 1)
     if stated:
         noise = np.array([straight.told.noise.variance[0] for straight in some])
-        fitting[noise > noise[0]] = -np.inf
+        fitting[(values < values[0]) | (noise > noise[0])] = -np.inf
         fitting[0] += sure
-        first = int(np.argmax(fitting))
-    best = some[first]
-    less, more = min(((fitting[first] - value, other.drift - best.drift)
-                      for other, value in zip(some[1:], fitting[1:], strict=True)
-                      if other.drift != best.drift and len(other.loops)), default=(np.inf, 0.0))
-    return best, more if less < sure and best is not some[0] else 0.0
+        values, first = fitting, int(np.argmax(fitting))
+    # Either way a rival is less likely by no more than two places are worth.
+    less = values[first] - values
+    rivals = [(less[k], other.drift - some[first].drift) for k, other in enumerate(some)
+              if max(less[k], fitting[first] - fitting[k]) < sure
+              and k and len(other.loops) and other.drift != some[first].drift]
+    if not first or not rivals:
+        return some[first], 0.0, np.inf
+    return some[first], min(rivals)[1], -float(np.logaddexp.reduce([-less for less, _ in rivals]))
 
 
 def _places(known: Growth, growth: Growth) -> int:
