@@ -16,8 +16,12 @@ parts are joined where loops of two places or more do. The sides of a gap are jo
 """
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import breadth_first_order
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
+from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
     log_odds_of_slips,
@@ -30,6 +34,7 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     asked,
     by_pair_of_parts,
     longest_run,
+    spanned,
     strongest_across,
 )
 from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
@@ -138,28 +143,62 @@ def settled(state: Growth, motion: Motion) -> Growth:
 
 def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
     """Return the step that slipped, by how the robot moves, of those that no loop tells apart."""
-    given = state.given
-    loops = given.is_loop & state.accepted
-    ends = np.unique((given.low[loops], given.high[loops]))
-    stretch = np.searchsorted(ends, given.low, side='right')
-    odometry = ~given.is_loop & (~state.cut | (np.arange(len(state.cut)) == cut))
-    steps = np.flatnonzero(odometry & (stretch == stretch[cut]))
-    gain = motion.log_density(*_repaired(state, cut, steps)) - motion.log_density(
+    steps, side = _in_series(state, cut)
+    gain = motion.log_density(*_repaired(state, cut, steps, side)) - motion.log_density(
         steps_of(state, steps))
     return int(steps[np.argmax(gain)])
+
+
+def _in_series(state: Growth, cut: int) -> tuple[Indices, Indices]:
+    """
+    Return the steps that all ways from one side of a cut to the other one lead along, (k,).
+
+    To cut one of these instead contradicts no loop. The first one is the cut itself.
+    And for each 1 or -1, whether these lead on along it or back, 0 for the cut, (k,).
+    """
+    given = state.given
+    start, end = int(given.low[cut]), int(given.high[cut])
+    n = given.graph.n_poses + 1  # the world is the last
+    holds = np.flatnonzero(state.accepted & ~state.cut)
+    low, high = given.low[holds] % n, given.high[holds]
+    joined = sparse.coo_array((np.ones(len(low)), (low, high)), (n, n)).tocsr()
+    before = breadth_first_order(joined, start, directed=False)[1]
+    way = [end]
+    while way[-1] != start and before[way[-1]] >= 0:
+        way.append(int(before[way[-1]]))
+    if way[-1] != start:
+        return np.array([cut]), np.zeros(1, np.int64)
+    one, other = np.array(way[:0:-1]), np.array(way[-2::-1])
+    # Of factors between the same keyframes the way leads along the first.
+    keys = pair_key(low, high, n)
+    order = np.argsort(keys, kind='stable')
+    along = order[np.searchsorted(keys[order], pair_key(one, other, n))]
+    rest = np.ones(len(holds), bool)
+    rest[along] = False
+    # What else leads on from the way leads back to it further on, or nowhere.
+    component = lowest_of_components(low[rest], high[rest], n)[np.append(one, end)]
+    first, last = (np.full(n, fill) for fill in (n, -1))
+    np.minimum.at(first, component, np.arange(len(component)))
+    np.maximum.at(last, component, np.arange(len(component)))
+    alone = (spanned(first[component], last[component], len(component)) == 0) & ~given.is_loop[
+        holds[along]]
+    return (np.append(cut, holds[along[alone]]), np.append(0, np.where(one < other, 1, -1)[alone]))
 
 
 def _cut_at(state: Growth, cut: int, step: int) -> Growth:
     """Return the state that is cut at a step and not where it is."""
     state, given = state.copy(), state.given
     state.cut[[cut, step]] = False, True
-    # What lies between goes over to the other side.
-    side = given.low[cut] if given.low[step] > given.low[cut] else given.high[cut]
-    between = np.arange(*np.sort(given.high[[cut, step]]))
-    chain, manifold = given.chain, given.graph.manifold
-    here, start = (np.tile(poses[side], (len(between), 1)) for poses in (state.poses, chain))
+    holds = state.accepted & ~state.cut
+    holds[cut] = False
+    part = component_labels(given.graph.subset(holds))
+    beyond = part == part[given.high[cut]]
+    manifold, row = given.graph.manifold, np.array([cut])
+    wanted = manifold.compose(state.poses[given.low[row]], given.factors.measurement[row])
+    motion = manifold.compose(wanted, manifold.inverse(state.poses[given.high[row]]))
     state.poses = state.poses.copy()
-    state.poses[between] = manifold.compose(here, manifold.between(start, chain[between]))
+    state.poses[beyond] = manifold.compose(
+        np.repeat(motion, np.count_nonzero(beyond), axis=0), state.poses[beyond])
     state.solve()
     state.accept_more()
     return state
@@ -191,7 +230,7 @@ def unusual(state: Growth, motion: Motion) -> Indices:
     found = []
     for cut in np.flatnonzero(state.cut & ~state.given.gap).tolist():
         row = np.array([cut])
-        repaired, spread = _repaired(state, cut, row)
+        repaired, spread = _repaired(state, cut, row, np.zeros(1, np.int64))
         density = max(motion.log_density(repaired, noise * spread)[0] for noise in (1.0, said))
         if (motion.distance(repaired[0], spread[0]).min() >= gate
                 and density <= motion.log_density(steps_of(state, row))[0]):
@@ -199,23 +238,23 @@ def unusual(state: Growth, motion: Motion) -> Indices:
     return np.array(found, np.int64)
 
 
-def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
+def _repaired(state: Growth, cut: int, steps: Indices, side: Indices) -> tuple[Array, Array]:
     """
     Return how the robot moved at some steps if one of these slipped rather than that which is cut.
 
-    Tangents (m, k) and their covariances (m, k, k): all that follows is moved alike.
+    Tangents (m, k) and their covariances (m, k, k). steps, side : (m,), see `_in_series`
     """
-    given = state.given
-    manifold, chain = given.graph.manifold, given.chain
-    measured = state.uncut()
-    row = np.array([cut])
-    count = len(steps)
+    given, poses = state.given, state.poses
+    manifold = given.graph.manifold
+    measured, row = state.uncut(), np.array([cut])
     root, spread = unwhitening(measured, row), measured.innovations(row).spread
-    low, high = given.low[row], given.high[row]
-    moved = manifold.between(state.poses[low], state.poses[high])
-    before = manifold.between(chain[given.low[steps]], np.repeat(chain[low], count, axis=0))
-    after = manifold.between(np.repeat(chain[high], count, axis=0), chain[given.high[steps]])
-    moved = manifold.compose(manifold.compose(before, np.repeat(moved, count, axis=0)), after)
+    count, side = len(steps), side[:, None]
+    high = np.repeat(poses[given.high[row]], count, axis=0)
+    back = np.repeat(manifold.compose(poses[given.low[row]], given.factors.measurement[row]),
+                     count, axis=0)
+    after = manifold.between(np.where(side < 0, back, high), poses[given.high[steps]])
+    moved = manifold.compose(manifold.between(
+        poses[given.low[steps]], np.where(side > 0, back, high)), after)
     start = manifold.identity(count)
     carried = manifold.local_jacobian(start, moved) @ manifold.adjoint(
         manifold.inverse(after)) @ root

@@ -21,7 +21,7 @@ from l1slam_ros.core.robust.pairwise_consistency import RUN, runs
 from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 
 # By so much more the odometry may vary than its good steps say, for a run to be looked at.
-_NOISIER = 30.0
+NOISIER = 30.0
 # Noise is learnt anew so often: once from noise that is far too large, and once from what was left
 # of that. Where only runs tell of it, more is left each time.
 _LEARNT_ANEW, _LEARNT_OF_RUNS = 2, 8
@@ -43,7 +43,7 @@ def with_runs(growth: Growth) -> Growth | None:
             loops.any() and given.may_err_as_one(np.flatnonzero(loops))):
         return None
     noisier = growth.copy()
-    noisier.noise = replace(noise, variance=noise.variance * (_NOISIER, 1.0))
+    noisier.noise = replace(noise, variance=noise.variance * (NOISIER, 1.0))
     noisier.solve()
     found = noisier.innovations(rows)
     groups = runs(growth, rows[found.square < given.gate(found.freedom)])

@@ -10,12 +10,12 @@
 Slips of the odometry: steps of which only the loops across can tell.
 
 A slip is suspected where the odds of one are not small (`motion`), or where loops that are left
-out agree. Then slip and lies are compared: the step is cut, the loops across are asked anew
-(`cuts`), and the rounds go on from there. To the odds comes half a gate for each place that is won
-and that nothing else explains, less one for each that is lost. A slip is believed if that makes it
-likelier than not. Loops do not make a robot jump: the slip repaired, it has to move as at some
-other step, or rather so than as measured. What fits the loops that came in without it did not
-slip: a lie, or another slip, had bent the map.
+out agree; several at once are looked for first (`together`). Then slip and lies are compared: the
+step is cut, the loops across are asked anew (`cuts`), and the rounds go on from there. To the odds
+comes half a gate for each place that is won and that nothing else explains, less one for each that
+is lost. A slip is believed if that makes it likelier than not. Loops do not make a robot jump: the
+slip repaired, it has to move as at some other step, or rather so than as measured. What fits the
+loops that came in without it did not slip: a lie, or another slip, had bent the map.
 """
 
 from collections.abc import Iterator
@@ -30,12 +30,15 @@ from l1slam_ros.core.robust.odometry.motion import (
     log_odds_of_slips,
     usual_motion,
 )
-from l1slam_ros.core.robust.odometry.noisier import with_runs
+from l1slam_ros.core.robust.odometry.noisier import NOISIER, with_runs
+from l1slam_ros.core.robust.odometry.together import agreeing, without_some
 from l1slam_ros.core.robust.odometry.untold import LEAST, untold_slip
 from l1slam_ros.core.robust.pairwise_consistency import gain_of, spanned, strongest_group
 from l1slam_ros.core.robust.rounds.evidence import FEWEST_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 
+# A step that may have slipped, the state without it and others, and what that costs.
+Attempt = tuple[int, Growth | None, float]
 # So many steps are tried for each reason.
 _TRIED = 2
 # What is nearly sure: ln of the odds.
@@ -58,8 +61,20 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         return None
     motion = usual_motion(growth)
     odds = log_odds_of_slips(growth, motion)
+    for attempts in (_together(growth, motion), _tried(growth, as_stated, motion)):
+        if found := _best(growth, as_stated, motion, odds, attempts):
+            return found
+    found = with_runs(growth)
+    if not found:
+        growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion)
+    return found
+
+
+def _best(growth: Growth, as_stated: Growth, motion: Motion, odds: Array,
+          attempts: Iterator[Attempt]) -> Growth | None:
+    """Return the state that is the likeliest of some, None: the one before is, see `_tried`."""
     found, most = None, 0.0
-    for step, state, costs in _tried(growth, as_stated, motion):
+    for step, state, costs in attempts:
         steps = np.flatnonzero(state.cut & ~growth.cut) if state else np.array([step])
         if not state or (costs and not len(steps)):  # a loop that was chosen shows a slip, or none
             _suspect(growth, step, float(odds[step]))
@@ -74,10 +89,19 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if evidence > most and (usual or (odds[steps] > 0).all()):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps.tolist(), evidence))
-    found = found or with_runs(growth)
-    if not found:
-        growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion)
     return found
+
+
+def _together(growth: Growth, motion: Motion) -> Iterator[Attempt]:
+    """Yield states without steps that slipped together, see `together`."""
+    agree = agreeing(growth)
+    for noisier in (1.0, NOISIER):
+        state = without_some(growth, agree, noisier)
+        if not state:  # in the other map they would hardly agree more, and both take long
+            return
+        state = put_back(settled(state, motion), motion)
+        for step in np.flatnonzero(state.cut & ~growth.cut)[:1].tolist():
+            yield step, state, 0.0
 
 
 def _suspect(growth: Growth, step: int, odds: float) -> None:
@@ -109,7 +133,7 @@ def _odds_in_the_end(growth: Growth, as_stated: Growth, motion: Motion) -> dict[
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None = None
-           ) -> Iterator[tuple[int, Growth | None, float]]:
+           ) -> Iterator[Attempt]:
     """
     Yield steps that are cut, the state without them, and what that costs, see `without`.
 
