@@ -43,22 +43,25 @@ class GrowingArray:
     def extend(self, rows: np.ndarray) -> None:
         """Append rows, (k, *shape)."""
         end = self._length + len(rows)
-        self._make_room(end)
+        if end > len(self._data):
+            self._move(end)
         self._data[self._length:end] = rows
         self._length = end
 
     def append(self, row: np.ndarray | float) -> None:
         """Append one row, (*shape)."""
-        self._make_room(self._length + 1)
-        self._data[self._length] = row
-        self._length += 1
-
-    def _make_room(self, end: int) -> None:
+        end = self._length + 1
         if end > len(self._data):
-            capacity = max(end, 2 * len(self._data), 16)
-            grown = np.empty((capacity, *self._data.shape[1:]), self._data.dtype)
-            grown[:self._length] = self.view()
-            self._data = grown
+            self._move(end)
+        self._data[end - 1] = row
+        self._length = end
+
+    def _move(self, end: int) -> None:
+        """Move all rows to where there is room for so many, and more."""
+        capacity = max(end, 2 * len(self._data), 16)
+        grown = np.empty((capacity, *self._data.shape[1:]), self._data.dtype)
+        grown[:self._length] = self.view()
+        self._data = grown
 
     def shorten(self, length: int) -> None:
         """Take back all rows but the first ones; views of those taken back are void."""

@@ -18,7 +18,7 @@ and the transitions are pure, so that they can be read without a lock.
     told        a person has vouched for factors or struck them out
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -256,3 +256,7 @@ class MapState(NamedTuple):
         if judgement.settled != settled:
             judgement = replace(judgement, settled=settled)
         return replace(last, judgement=judgement, seconds=seconds)
+
+
+# The next state, by the present one and the factors that there are.
+Transition = Callable[[MapState, BetweenFactors], MapState]

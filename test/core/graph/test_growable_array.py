@@ -53,6 +53,18 @@ def test_appending_moves_the_rows_only_now_and_then():
     assert moves < 12
 
 
+def test_one_row_is_appended_as_several_are_and_the_last_ones_are_taken_back():
+    array, seen = GrowingArray((2,)), []
+    for k in range(40):
+        array.append(rows(k, 1)[0])
+        seen.append(array.view())
+    assert all((view == rows(0, k + 1)).all() for k, view in enumerate(seen))
+    array.shorten(17)
+    assert (array.view() == rows(0, 17)).all()
+    array.append(rows(30, 1)[0])
+    assert (array.view() == np.concatenate((rows(0, 17), rows(30, 1)))).all()
+
+
 @pytest.mark.parametrize('wanted', [[0, 8, 3, 3], [-1], []])
 @pytest.mark.parametrize('array', [rows(0, 9), np.arange(9), np.arange(9) > 4],
                          ids=['rows', 'numbers', 'mask'])
