@@ -234,7 +234,7 @@ def test_messages_and_updates_do_not_wait_while_the_next_state_is_worked_out():
         return state._replace(made=float(len(seen)))
 
     with backend.calm:
-        backend._keeper.change(backend.snapshot(), transition)
+        backend._keeper.change(backend.snapshot().map, transition)
     # Each time the state was another one by then; the fourth time nothing could come in.
     assert [count for _, count in seen] == [4, 5, 6, 7]
     assert len({id(state) for state, _ in seen}) == 4
@@ -261,7 +261,7 @@ def test_what_a_person_says_while_the_next_state_is_worked_out_holds():
             replace(judgement, accepted=accepted), factors))
 
     with backend.calm:
-        backend._keeper.change(backend.snapshot(), refused)
+        backend._keeper.change(backend.snapshot().map, refused)
     assert backend._keeper.look()[1].trusted[row]
     assert backend._keeper.state.table.accepted[row]
 

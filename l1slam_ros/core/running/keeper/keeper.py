@@ -304,10 +304,13 @@ class Keeper:
         carried = Carried.by(front) if front else None
         former = self._front
         tolerance = self._solver.outer_tolerance
-        with self._changed(improvement.map, lambda state, factors: state.adopted(
-                improvement, carried, looks, pending, factors, tolerance, time.monotonic())):
+
+        def publish() -> None:
             self._front = front
             self._move(ends)
+
+        self.change(improvement.map, lambda state, factors: state.adopted(
+            improvement, carried, looks, pending, factors, tolerance, time.monotonic()), publish)
         # To free its memory takes long, so an update must not hold the last reference.
         with self._front_lock:
             pass
@@ -319,25 +322,18 @@ class Keeper:
             self._state = self._state.being_judged(time.monotonic())
             return now, self._revisions.grown
 
-    def change(self, made_for: Snapshot, transition: Transition) -> None:
+    def change(self, began: int, transition: Transition,
+               publish: Callable[[], None] = lambda: None) -> None:
         """
-        Replace the state by `transition` of it; made_for : the snapshot that the result is of.
+        Replace the state by `transition` of it; publish : called then, with both locks.
+
+        That takes milliseconds where the graph is large, so it is worked out without a lock, and
+        again where the state has changed meanwhile; at last with both. began : names the map.
 
         Raises
         ------
-        Interrupted : another map has begun since the snapshot.
+        Interrupted : another map has begun.
 
-        """
-        with self._changed(made_for.map, transition):
-            self._revisions = self._revisions.after()
-
-    @contextmanager
-    def _changed(self, began: int, transition: Transition) -> Iterator[None]:
-        """
-        Replace the state by `transition` of it; both locks are held within the block.
-
-        That takes milliseconds where the graph is large, so it is worked out without a lock, and
-        again where the state has changed meanwhile; at last with both. began : names the map
         """
         for _ in range(_TRIES):
             state, factors, _ = self.look()
@@ -349,10 +345,11 @@ class Keeper:
                     # Of factors that were there already, a person may have said something since.
                     now = self._builder.graph.between
                     self._state = found if now is factors else found.told(now)
-                    yield
-                    return
+                    self._revisions = self._revisions.after()
+                    return publish()
         with self._front_lock, self._graph_lock:
             if self._state.began != began:
                 raise Interrupted
             self._state = transition(self._state, self._builder.graph.between)
-            yield
+            self._revisions = self._revisions.after()
+            publish()
