@@ -149,10 +149,9 @@ class BorderedSystem:
         rows = np.empty((self._k, self.rows))
         expected = residual.copy()
         covariance = np.empty((self._k, self._k))
-        now = self._now
         kernels.border.predict(
-            self._points.covariance, self._points.mean, now.ends, now.blocks, now.factor,
-            now.right, points, blocks, rows, covariance, expected)
+            self._points.covariance, self._points.mean, self._ends.view(), self._blocks.view(),
+            self._factor.view(), self._right.view(), points, blocks, rows, covariance, expected)
         return Prediction(expected, covariance, rows, points, blocks)
 
     def add(self, predicted: Prediction, noise: Array) -> None:
@@ -165,13 +164,18 @@ class BorderedSystem:
 
         """
         pivot = np.linalg.cholesky(predicted.covariance + np.diag(noise))
-        # Row r ends at its diagonal.
-        for r, row in enumerate(predicted.rows):
-            self._factor.extend(row)
-            self._factor.extend(pivot[r, :r + 1])
+        before, k = self.rows, self._k
+        factor = np.empty(triangle(before + k) - triangle(before))
+        end = 0
+        for r in range(k):  # row r ends at its diagonal
+            begin, end = end, end + before + r + 1
+            factor[begin:begin + before] = predicted.rows[r]
+            factor[begin + before:end] = pivot[r, :r + 1]
+        self._factor.extend(factor)
         self._right.extend(-np.linalg.solve(pivot, predicted.residual))
-        self._ends.extend(predicted.points[None])
-        self._blocks.extend(predicted.blocks[None])
+        self._ends.append(predicted.points)
+        self._blocks.append(predicted.blocks)
+        self._points.used.update(predicted.points.tolist())
         self._pulled = self._pulled[:0]
 
     def covariance(self, keyframe: int, other: int, turn: Array) -> Array:
@@ -189,7 +193,7 @@ class BorderedSystem:
     def forget_unused(self, since: int) -> None:
         """Take back the points that came since there were so many, where no factor kept them."""
         if self.points > since:
-            self._points.forget(since, np.append(self._ends.view(), self._points.parents))
+            self._points.forget(since)
             self._pulled = self._pulled[:self.points]
 
     def step(self, keyframes: list[int]) -> Array:

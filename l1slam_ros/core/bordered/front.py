@@ -29,6 +29,7 @@ from functools import cached_property
 import numpy as np
 
 from l1slam_ros.core.bordered.bordered_system import BorderedSystem, Prediction, Steps
+from l1slam_ros.core.bordered.linearised import Linearised, Pair, in_order
 from l1slam_ros.core.bordered.points import FIXED
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
@@ -68,25 +69,6 @@ class Look:
 
 # The look at a factor that was skipped.
 _SKIPPED = Look(False, False, np.nan)
-
-
-@dataclass(frozen=True)
-class Linearised:
-    """
-    New factors, whitened, in both maps.
-
-    ends : (m, 2) what their keyframes are called in the bordered systems; blocks :
-    (m, 2, 2, k, k) by map and side; residual : (m, 2, k) at no step
-    """
-
-    ends: Indices
-    blocks: Array
-    residual: Array
-
-    def of(self, which: int, at: int) -> tuple[tuple[int, int], Array, Array]:
-        """Return the ends, blocks and residual of one of them, in one of the maps."""
-        i, j = self.ends[at].tolist()
-        return (i, j), self.blocks[at, which], self.residual[at, which]
 
 
 @dataclass(frozen=True)
@@ -187,7 +169,7 @@ class Front:
 
     def poses_of(self, keyframes: Indices) -> Array:
         """Return the L1 poses of some keyframes that it knows, (m, p)."""
-        steps = self._systems[L1].step(np.maximum(keyframes - self._fixed, FIXED).tolist())
+        steps = self._systems[L1].step(list(map(self._end, keyframes.tolist())))
         first = few_rows(self._first.view(), keyframes)[:, L1]
         return self._manifold.retract(first, steps)
 
@@ -202,8 +184,8 @@ class Front:
         if seen_from is not None:
             here, there = self.poses_of(np.array([keyframe, seen_from]))[:, None]
             turn = self._manifold.adjoint(self._manifold.between(here, there))[0]
-            other = max(seen_from - self._fixed, FIXED)
-        return self._systems[L2].covariance(max(keyframe - self._fixed, FIXED), other, turn)
+            other = self._end(seen_from)
+        return self._systems[L2].covariance(self._end(keyframe), other, turn)
 
     def take(self, factors: BetweenFactors, what: Indices) -> list[Look]:
         """
@@ -213,24 +195,30 @@ class Front:
         fewer where the next one is beyond it: it takes no more then
         """
         looks: list[Look] = []
-        asked = np.flatnonzero(what != SKIP)
-        if not len(asked):
-            self.rows += len(what)
-            return len(what) * [_SKIPPED]
-        self.closed = self._is_beyond(factors, self.rows + asked[0], what[asked[0]])
+        wanted = what.tolist()
+        rows = range(self.rows, self.rows + len(wanted))
+        asked = [row for row, one in zip(rows, wanted, strict=True) if one != SKIP]
+        if not asked:
+            self.rows += len(wanted)
+            return len(wanted) * [_SKIPPED]
+        pairs = list(zip(factors.i[rows.start:rows.stop].tolist(),
+                         factors.j[rows.start:rows.stop].tolist(), strict=True))
+        first = asked[0] - rows.start
+        self.closed = self._is_beyond(pairs[first], wanted[first])
         if self.closed:
             return looks
         # Only these: each keyframe that is touched makes the next one cost more.
         before = [system.points for system in self._systems]
-        linearised = self._linearise(factors, self.rows + asked)
-        place = np.cumsum(what != SKIP) - 1
-        for one, at in zip(what.tolist(), place.tolist(), strict=True):
+        linearised = self._linearise(factors, asked, [pairs[row - rows.start] for row in asked])
+        at = 0
+        for pair, one in zip(pairs, wanted, strict=True):
             if one == SKIP:
                 look: Look | None = _SKIPPED
-            elif self._is_beyond(factors, self.rows, one):
+            elif self._is_beyond(pair, one):
                 look = None
             else:
-                look = self._look(factors, linearised, at, one)
+                look = self._look(factors, linearised, at, pair, one)
+                at += 1
             if look is None:
                 self.closed = True
                 break
@@ -241,23 +229,23 @@ class Front:
             system.forget_unused(points)
         return looks
 
-    def _is_beyond(self, factors: BetweenFactors, row: int, what: int) -> bool:
+    def _is_beyond(self, pair: Pair, what: int) -> bool:
         """Tell whether a factor must wait for the next map."""
-        return (max(factors.i[row], factors.j[row]) > self.keyframes
-                or (what == BELIEVE and self._turns(factors, row))
+        return (max(pair) > self.keyframes or (what == BELIEVE and self._turns(pair))
                 or self.border > MOST_ROWS or self._systems[L2].points > _MOST_POINTS)
 
-    def _turns(self, factors: BetweenFactors, row: int) -> bool:
+    def _turns(self, pair: Pair) -> bool:
         """Tell whether a factor is the first that names the world: the gauge is another."""
-        return bool(factors.i[row] == WORLD) and self._fixed > 0
+        return pair[0] == WORLD and self._fixed > 0
 
-    def _look(self, factors: BetweenFactors, new: Linearised, at: int, what: int) -> Look | None:
+    def _look(self, factors: BetweenFactors, new: Linearised, at: int, pair: Pair,
+              what: int) -> Look | None:
         """Gate a factor, and make it part of the map where it is accepted; None: it cannot be."""
-        own = np.diag(factors.sqrt_information[self.rows])
+        own = factors.sqrt_information[self.rows].diagonal()
         # A factor that leaves a component unsaid is left to the judge.
-        if what == GATE and (self._turns(factors, self.rows) or not own.all()):
+        if what == GATE and (self._turns(pair) or not own.all()):
             return Look(False, True, np.nan)
-        first_seen = self.keyframes in (factors.i[self.rows], factors.j[self.rows])
+        first_seen = self.keyframes in pair
         l1, l2 = self._systems
         try:
             if first_seen:
@@ -299,7 +287,8 @@ class Front:
         return Look(accepted, fits and not accepted,
                     sigmas if accepted else float(np.sqrt(nis))), left
 
-    def _linearise(self, factors: BetweenFactors, rows: Indices) -> Linearised:
+    def _linearise(self, factors: BetweenFactors, asked: list[int],
+                   pairs: list[Pair]) -> Linearised:
         """
         Return factors as the bordered systems want them, up to the first that is beyond them.
 
@@ -307,17 +296,14 @@ class Front:
         be seen in the order of their indices, so a factor that skips one is beyond.
         """
         manifold = self._manifold
-        pairs = np.stack((few_rows(factors.i, rows), few_rows(factors.j, rows)), axis=1)
-        newest = np.maximum.accumulate(np.append(len(self._first) - 1, pairs.max(axis=1)))
-        skips = np.flatnonzero(np.diff(newest) > 1)
-        pairs = pairs[:skips[0] if len(skips) else None]
-        rows = rows[:len(pairs)]
+        pairs = pairs[:in_order(pairs, len(self._first))]
+        rows = np.array(asked[:len(pairs)])
         Z, root = few_rows(factors.measurement, rows), few_rows(factors.sqrt_information, rows)
         if self._drift:
             odometry = factors.is_odometry[rows]
             Z[odometry] = corrected(factors, rows[odometry], self._drift)
         self._put_new(pairs, Z)
-        first, steps, poses = self._moved(pairs.T.ravel())
+        first, steps, poses = self._moved([*(i for i, _ in pairs), *(j for _, j in pairs)])
         p, k = first.shape[2], steps.shape[2]
         # Of each factor in both maps: Jacobians at the first poses, residuals at those of now.
         Z = np.repeat(Z, 2, axis=0)
@@ -329,22 +315,30 @@ class Front:
         # As it would be at no step: r + J x is e then at the step there is.
         steps = steps.reshape(2, -1, 2, k).transpose(1, 2, 0, 3)
         residual = whitened - (blocks @ steps[..., None])[..., 0].sum(axis=2)
-        return Linearised(np.maximum(pairs - self._fixed, FIXED), blocks, residual)
+        return Linearised([(self._end(i), self._end(j)) for i, j in pairs], blocks, residual)
 
-    def _put_new(self, pairs: Indices, Z: Array) -> None:
-        """Put keyframes that are seen for the first time, pairs (m, 2), where Z (m, p) says."""
+    def _put_new(self, pairs: list[Pair], Z: Array) -> None:
+        """Put keyframes that are seen for the first time where Z (m, p) says."""
         manifold = self._manifold
-        for row in np.flatnonzero((pairs >= len(self._first)).any(axis=1)).tolist():
-            if pairs[row].max() == len(self._first):
-                step = Z[row] if pairs[row, 1] == len(self._first) else manifold.inverse(Z[row])
-                _, _, seen_from = self._moved(pairs[row].min(keepdims=True))
-                self._first.extend(manifold.compose(seen_from, step))
+        for pair, seen in zip(pairs, Z, strict=True):
+            new = len(self._first)
+            if max(pair) == new:
+                _, _, seen_from = self._moved([min(pair)])
+                self._first.extend(manifold.compose(
+                    seen_from, seen if pair[1] == new else manifold.inverse(seen)))
 
-    def _moved(self, keyframes: Indices) -> tuple[Array, Array, Array]:
+    def _moved(self, keyframes: list[int]) -> tuple[Array, Array, Array]:
         """Return where keyframes began, their steps and where they are, (m, 2, p or k) each."""
-        manifold = self._manifold
-        first = few_rows(self._first.view(), keyframes)
-        first[keyframes == WORLD] = manifold.identity(1)
-        ends = np.maximum(keyframes - self._fixed, FIXED).tolist()
-        steps = np.stack([system.step(ends) for system in self._systems], axis=1)
+        manifold, known = self._manifold, self._first.view()
+        first = np.empty((len(keyframes), *known.shape[1:]))
+        steps = np.empty((*first.shape[:2], len(self._usual)))
+        for at, keyframe in enumerate(keyframes):
+            first[at] = known[keyframe] if keyframe != WORLD else manifold.identity(1)
+        ends = list(map(self._end, keyframes))
+        for which, system in enumerate(self._systems):
+            steps[:, which] = system.step(ends)
         return first, steps, manifold.retract(first, steps)
+
+    def _end(self, keyframe: int) -> int:
+        """Return what a keyframe is called in the bordered systems."""
+        return max(keyframe - self._fixed, FIXED)

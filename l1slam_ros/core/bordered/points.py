@@ -82,12 +82,17 @@ class Points:
     size, k : old keyframes, and numbers of the step of each
     most : so many points may come without moving those before: that takes longer than to append
 
+    Attributes
+    ----------
+    used : those that factors name, or that new keyframes hang on: these stay, see `forget`
+
     """
 
     def __init__(self, cholesky: BlockCholesky, size: int, k: int, most: int = 0):
         self._cholesky = cholesky
         self._size = size
         self._k = k
+        self.used: set[int] = set()
         self._of_old: dict[int, int] = {}
         self._of_new: list[int] = []
         # Where each is in the order of elimination, -1 for a new one.
@@ -118,11 +123,6 @@ class Points:
         """m, (t, k)."""
         return self._mean.view()
 
-    @property
-    def parents(self) -> Indices:
-        """Of each the point that it hangs on, (t,), `FIXED` for none."""
-        return self._parent.view()
-
     def now(self) -> PointsNow:
         """Return the points as they are; those to come change nothing of it."""
         old = np.array([*self._of_old.items()], np.int64).reshape(-1, 2).T[::-1]
@@ -149,35 +149,36 @@ class Points:
             mean = mean + turn @ self.mean[parent]
         product = np.empty((len(self) + 1, self._k, self._k))
         kernels.border.follow(self.covariance, parent, turn, noise, product)
-        self._at.extend(np.array([FIXED]))
-        self._begins.extend(np.array([FIXED]))
+        self.used.add(parent)
+        self._at.append(FIXED)
+        self._begins.append(FIXED)
         self._of_new.append(self._append(product, mean, parent, turn, noise))
 
-    def forget(self, since: int, used: Indices) -> None:
+    def forget(self, since: int) -> None:
         """
         Take back points of old keyframes that came since there were so many, but for those used.
 
         Each makes the next one cost more. The last ones leave nothing behind.
         """
         came = takewhile(lambda one: one[1] >= since, reversed(self._of_old.items()))
-        for keyframe, point in [one for one in came if one[1] not in used]:
+        for keyframe, point in [one for one in came if one[1] not in self.used]:
             del self._of_old[keyframe]
             self._at.view()[point] = FIXED
             if point == len(self) - 1:
                 begin = int(self._begins.view()[point])
-                columns = len(self._columns) if begin < 0 else begin
-                ends = ((self._at, point), (self._begins, point), (self._columns, columns),
-                        (self._covariance, triangle(point)), (self._mean, point),
-                        (self._parent, point), (self._turn, point), (self._noise, point))
-                for array, length in ends:
-                    array.replace(length, array.view()[:0])
+                if begin >= 0:
+                    self._columns.shorten(begin)
+                self._covariance.shorten(triangle(point))
+                for array in (self._at, self._begins, self._mean, self._parent, self._turn,
+                              self._noise):
+                    array.shorten(point)
 
     def _reach(self, keyframe: int) -> int:
         """Append an old keyframe; return its point."""
         none = np.zeros((1, self._k, self._k))
         position = int(self._cholesky.pattern.position[keyframe])
-        self._at.extend(np.array([position]))
-        self._begins.extend(np.array([FIXED]))
+        self._at.append(position)
+        self._begins.append(FIXED)
         product, columns = self._cholesky.covariances(
             self._at.view(), np.append(self._parent.view(), FIXED),
             np.concatenate((self._turn.view(), none)), self._columns.view(), self._begins.view())
@@ -190,8 +191,8 @@ class Points:
                 noise: Array) -> int:
         """Append a point with its covariances with all, (t + 1, k, k); return it."""
         self._covariance.extend(product)
-        self._mean.extend(mean[None])
-        self._parent.extend(np.array([parent]))
-        self._turn.extend(turn[None])
-        self._noise.extend(noise[None])
+        self._mean.append(mean)
+        self._parent.append(parent)
+        self._turn.append(turn)
+        self._noise.append(noise)
         return len(self) - 1

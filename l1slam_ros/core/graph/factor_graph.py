@@ -277,8 +277,8 @@ class FactorGraph:
     def append_between(self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
                        trusted: Mask | bool = False, struck: Mask | bool = False) -> None:
         """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
-        values = (i, j, measurement, sqrt_information, np.broadcast_to(trusted, len(i)),
-                  np.broadcast_to(struck, len(i)))
+        none = np.zeros(len(i), bool)
+        values = i, j, measurement, sqrt_information, none | trusted, none | struck
         for column, value in zip(self._between, values, strict=True):
             column.extend(value)
         self._factors = None

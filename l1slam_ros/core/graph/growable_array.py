@@ -9,6 +9,8 @@
 """An array that grows at its end."""
 
 import mmap
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -16,6 +18,10 @@ from numpy.typing import DTypeLike
 # Memory of this process alone; elsewhere it is so anyway.
 _PRIVATE = ({'flags': mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, 'MAP_PRIVATE')
             else {})
+# [bytes] To move what is as large may take many milliseconds, so it is moved once more, to where
+# there is room for so many times what it would need next.
+_LARGE = 2**17
+_AHEAD = 64
 
 
 class GrowingArray:
@@ -40,16 +46,42 @@ class GrowingArray:
     def __len__(self) -> int:
         return self._length
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the rows without the room for more."""
+        return {'_data': self.view(), '_length': self._length}
+
     def extend(self, rows: np.ndarray) -> None:
         """Append rows, (k, *shape)."""
         end = self._length + len(rows)
         if end > len(self._data):
-            capacity = max(end, 2 * len(self._data), 16)
-            grown = np.empty((capacity, *self._data.shape[1:]), self._data.dtype)
-            grown[: self._length] = self.view()
-            self._data = grown
-        self._data[self._length : end] = rows
+            self._move(end)
+        self._data[self._length:end] = rows
         self._length = end
+
+    def append(self, row: np.ndarray | float) -> None:
+        """Append one row, (*shape)."""
+        end = self._length + 1
+        if end > len(self._data):
+            self._move(end)
+        self._data[end - 1] = row
+        self._length = end
+
+    def _move(self, end: int) -> None:
+        """Move all rows to where there is room for so many, and more."""
+        capacity = max(end, 2 * len(self._data), 16)
+        shape, dtype = self._data.shape[1:], self._data.dtype
+        grown = None
+        if self._length and self._data.nbytes >= _LARGE and _PRIVATE:
+            with suppress(OSError, MemoryError):
+                grown = _reserved((_AHEAD * capacity, *shape), dtype)
+        if grown is None:
+            grown = np.empty((capacity, *shape), dtype)
+        grown[:self._length] = self.view()
+        self._data = grown
+
+    def shorten(self, length: int) -> None:
+        """Take back all rows but the first ones; views of those taken back are void."""
+        self._length = length
 
     def replace(self, start: int, rows: np.ndarray) -> None:
         """Let rows (k, *shape) stand from `start` on; views of what stood there are void."""

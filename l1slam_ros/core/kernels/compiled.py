@@ -25,8 +25,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from numpy import ndarray
-
 from l1slam_ros.core.kernels.kept import link, objects
 
 Kernel = Callable[..., Any]
@@ -73,26 +71,12 @@ class Loop:
     def __call__(self, *arguments: Any) -> Any:
         """Call what was compiled for arguments of these types."""
         tried = self.linked
-        for wanted, function in tried:
-            if len(wanted) != len(arguments):
-                continue
-            for argument, (entries, count, kinds) in zip(arguments, wanted, strict=True):
-                if entries is not None:
-                    # The last: in C order, aligned and writable.
-                    if not (type(argument) is ndarray and argument.ndim == count
-                            and (argument.dtype is entries or argument.dtype == entries)
-                            and argument.flags.carray):
-                        break
-                elif count < 0:
-                    if type(argument) not in kinds:
-                        break
-                elif (type(argument) is not tuple or len(argument) != count
-                        or not kinds.issuperset(map(type, argument))):
-                    break
-            else:
+        for count, fit, function in tried:
+            if len(arguments) == count and fit(*arguments):
                 return function(*arguments)
         for space in False, True:
-            self.seek(space)
+            if space not in self._sought:
+                self.seek(space)
             if self.linked is not tried:
                 return self(*arguments)
         return self.dispatcher(*arguments)

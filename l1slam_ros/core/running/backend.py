@@ -35,7 +35,8 @@ from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame
 from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.running.improve import Improvement
-from l1slam_ros.core.running.keeper.keeper import Keeper, Revisions
+from l1slam_ros.core.running.keeper.keeper import Keeper
+from l1slam_ros.core.running.keeper.revisions import Revisions
 from l1slam_ros.core.running.keeper.updates import Updates
 from l1slam_ros.core.running.keeper.workers import Background
 from l1slam_ros.core.running.keeper.workers import Stopped as Stopped

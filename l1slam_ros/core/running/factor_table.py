@@ -184,10 +184,10 @@ class FactorTable:
         """Return what a front does with the factors from `first` to `last`, see `Front.take`."""
         next_ones = slice(first, min(last, len(factors)))
         what = np.where(factors.trusted[next_ones] | (not robust), BELIEVE, GATE)
-        known = self.accepted[next_ones]
-        what[:len(known)] = np.where(known, BELIEVE, SKIP)
-        what[factors.struck[next_ones]] = SKIP
-        return what
+        if first < self.looked:
+            known = self.accepted[next_ones]
+            what[:len(known)] = np.where(known, BELIEVE, SKIP)
+        return np.where(factors.struck[next_ones], SKIP, what)
 
     def for_new_front(self, factors: BetweenFactors, part: Mask, again: bool) -> Indices:
         """

@@ -18,7 +18,7 @@ and the transitions are pure, so that they can be read without a lock.
     told        a person has vouched for factors or struck them out
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -92,8 +92,7 @@ class Judged:
         return replace(after, took=now - self.began)
 
 
-@dataclass(frozen=True)
-class MapState:
+class MapState(NamedTuple):
     """
     The state of the map of one graph.
 
@@ -167,7 +166,7 @@ class MapState:
         table = self.table.told(factors)
         if table is self.table:
             return self
-        return replace(self, table=table, judged=replace(self.judged, loops=_TOLD_SINCE))
+        return self._replace(table=table, judged=replace(self.judged, loops=_TOLD_SINCE))
 
     def taken(self, looks: Sequence[Look], carried: Carried) -> 'MapState':
         """Return the state after the front has taken and gated some factors."""
@@ -177,11 +176,11 @@ class MapState:
         wanted = any(look.suspect for look in new)
         if wanted and not judged.wanted:
             judged = replace(judged, wanted=True)
-        return replace(self, table=self.table.with_looks(new), carried=carried, judged=judged)
+        return self._replace(table=self.table.with_looks(new), carried=carried, judged=judged)
 
     def being_judged(self, now: float) -> 'MapState':
         """Return the state while the judge works on all present loops."""
-        return replace(self, judged=replace(self.judged, wanted=False, began=now))
+        return self._replace(judged=replace(self.judged, wanted=False, began=now))
 
     def judged_by(self, judgement: Judgement, poses: Array, loops: int, anew: bool,
                   factors: BetweenFactors, now: float) -> 'MapState':
@@ -191,19 +190,19 @@ class MapState:
         A judgement that accepts other factors than the map uses, or corrects them otherwise, is
         pending until a map is made of it; anew : it is from the graph alone
         """
-        after = replace(self, judged=self.judged.after(judgement, poses, loops, anew, now))
+        after = self._replace(judged=self.judged.after(judgement, poses, loops, anew, now))
         accepted = self.table.accepted[:len(judgement.accepted)]
         same = judgement.drift == self.of_all.drift and np.array_equal(
             judgement.accepted, accepted)
         if self.pending is not None or not same:
-            return replace(after, pending=judgement)
+            return after._replace(pending=judgement)
         return after._committed(judgement, factors)
 
     def _committed(self, judgement: Judgement, factors: BetweenFactors) -> 'MapState':
         """Return the state with a judgement in its table."""
         none = self.of_all
-        return replace(
-            self, table=self.table.judged(judgement, factors),
+        return self._replace(
+            table=self.table.judged(judgement, factors),
             of_all=replace(judgement, accepted=none.accepted, suspect=none.suspect,
                            sigmas=none.sigmas, noise=none.noise))
 
@@ -225,14 +224,14 @@ class MapState:
         made = improvement.judgement
         if pending is not None:
             after = self._committed(pending, factors)
-            after = replace(after, pending=None if self.pending is pending else self.pending)
+            after = after._replace(pending=None if self.pending is pending else self.pending)
         proved = improvement.gap < np.inf
         bound = (improvement.cost - improvement.gap, now) if proved else (
             self.bound, self.bound_at)
         end = carried.rows if carried else len(made.accepted)
         wanted = self.judged.wanted or any(look.suspect for look in looks)
-        return replace(
-            after, optimised=improvement.taken_over(self.optimised, tolerance),
+        return after._replace(
+            optimised=improvement.taken_over(self.optimised, tolerance),
             table=after.table.adopted(made, looks, end, pending is not None, proved),
             judged=replace(self.judged, wanted=wanted), carried=carried, last=improvement,
             made=now, bound=bound[0], bound_at=bound[1])
@@ -242,7 +241,8 @@ class MapState:
         if self.optimised is not earlier.optimised or self.of_all is not earlier.of_all:
             return self
         of_all = replace(self.of_all, doubts=tuple(dict.fromkeys(self.of_all.doubts + doubts)))
-        return replace(self, of_all=of_all, judged=replace(self.judged, compared=self.optimised))
+        return self._replace(
+            of_all=of_all, judged=replace(self.judged, compared=self.optimised))
 
     def account(self, loops: int, seconds: float) -> Improvement:
         """Return the last `Improvement`, as the result of an update that took `seconds`."""
@@ -252,4 +252,11 @@ class MapState:
             judgement = replace(self.table.judgement(self.of_all), settled=settled)
             return Improvement(self.began, self.optimised.poses, self.optimised.dual, judgement,
                                0.0, 0.0, Status.OUT_OF_TIME, 0, 0, 0, np.inf, seconds)
-        return replace(last, judgement=replace(last.judgement, settled=settled), seconds=seconds)
+        judgement = last.judgement
+        if judgement.settled != settled:
+            judgement = replace(judgement, settled=settled)
+        return replace(last, judgement=judgement, seconds=seconds)
+
+
+# The next state, by the present one and the factors that there are.
+Transition = Callable[[MapState, BetweenFactors], MapState]

@@ -80,7 +80,7 @@ class Seen(NamedTuple):
     The graph at one moment, which can be read without a lock.
 
     factors : of it; robot : (n,) of each keyframe; numbers : of each robot the keyframes, (k,);
-    firsts : (r, p) the odometry of their first ones, by robot
+    firsts : (1, p) the odometry of their first ones, by robot, where there are several
     """
 
     manifold: Manifold
@@ -93,7 +93,8 @@ class Seen(NamedTuple):
     def of(builder: GraphBuilder) -> 'Seen':
         """Return a copy of the graph of a builder."""
         tracks = {robot: one.track for robot, one in builder.robots.items() if len(one.track)}
-        firsts = {robot: track.poses_of(slice(0, 1)) for robot, track in tracks.items()}
+        firsts = {robot: track.poses_of(slice(0, 1)) for robot, track in tracks.items()
+                  } if len(tracks) > 1 else {}
         return Seen(builder.graph.manifold, builder.graph.between, builder.graph.robot,
                     {robot: track.numbers.view() for robot, track in tracks.items()}, firsts)
 

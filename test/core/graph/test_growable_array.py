@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """An array that grows: views stay valid, copies part ways, the cost stays linear."""
 
+import pickle
 import re
 from pathlib import Path
 
@@ -51,6 +52,34 @@ def test_appending_moves_the_rows_only_now_and_then():
         address = array.view().__array_interface__['data'][0]
         moves, home = moves + (address != home), address
     assert moves < 12
+
+
+def test_rows_that_are_many_are_moved_once_more():
+    """Of 16,384 factors on it took a message 40 ms to have its own appended."""
+    array, moves, home = GrowingArray((2,)), 0, None
+    for k in range(200):
+        array.extend(rows(1000 * k, 1000))
+        address = array.view().__array_interface__['data'][0]
+        moves, home = moves + (k >= 20 and address != home), address
+    assert moves == 0
+    assert (array.view() == rows(0, 200_000)).all()
+    stored = pickle.dumps(array)
+    assert len(stored) < 1.01 * array.view().nbytes
+    again = pickle.loads(stored)
+    again.append(rows(200_000, 1)[0])
+    assert (again.view() == rows(0, 200_001)).all() and len(array) == 200_000
+
+
+def test_one_row_is_appended_as_several_are_and_the_last_ones_are_taken_back():
+    array, seen = GrowingArray((2,)), []
+    for k in range(40):
+        array.append(rows(k, 1)[0])
+        seen.append(array.view())
+    assert all((view == rows(0, k + 1)).all() for k, view in enumerate(seen))
+    array.shorten(17)
+    assert (array.view() == rows(0, 17)).all()
+    array.append(rows(30, 1)[0])
+    assert (array.view() == np.concatenate((rows(0, 17), rows(30, 1)))).all()
 
 
 @pytest.mark.parametrize('wanted', [[0, 8, 3, 3], [-1], []])

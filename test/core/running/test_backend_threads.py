@@ -12,7 +12,7 @@ import os
 import sys
 import threading
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -217,6 +217,53 @@ def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
     assert isinstance(ended[0], Interrupted) and not len(backend.snapshot().poses)
     drive(backend, 100, 102)
     np.testing.assert_allclose(backend.snapshot().poses[:, 0], [100, 101])
+
+
+def test_messages_and_updates_do_not_wait_while_the_next_state_is_worked_out():
+    backend, seen = Backend(EVERY), []
+    drive(backend, 0, 5)
+    backend.settle()
+
+    def transition(state, factors):
+        seen.append((state, len(factors)))
+        if len(seen) <= 3:
+            other = meanwhile(lambda: (drive(backend, 4 + len(seen), 5 + len(seen)),
+                                       backend.update(0.0)))
+            other.join(DEADLINE)
+            assert not other.is_alive()
+        return state._replace(made=float(len(seen)))
+
+    with backend.calm:
+        backend._keeper.change(backend.snapshot().map, transition)
+    # Each time the state was another one by then; the fourth time nothing could come in.
+    assert [count for _, count in seen] == [4, 5, 6, 7]
+    assert len({id(state) for state, _ in seen}) == 4
+    assert backend._keeper.state.made == 4.0
+
+
+def test_what_a_person_says_while_the_next_state_is_worked_out_holds():
+    backend = Backend(EVERY)
+    drive(backend, 0, 9)
+    found = loop(1, 9, (8.0, 0.0, 0.0), covariance6(1e-4 * np.eye(3)))
+    backend.add_loop(found)
+    backend.settle()
+    row = int(backend.snapshot().loop_rows[0])
+    assert backend.snapshot().judgement.accepted[row]
+
+    def refused(state, factors):
+        other = meanwhile(lambda: (backend.add_loop(replace(found, trusted=True)),
+                                   backend.snapshot()))
+        other.join(MOMENT)
+        judgement = state.table.judgement(state.of_all)
+        accepted = judgement.accepted.copy()
+        accepted[row] = False
+        return state._replace(table=state.table.judged(
+            replace(judgement, accepted=accepted), factors))
+
+    with backend.calm:
+        backend._keeper.change(backend.snapshot().map, refused)
+    assert backend._keeper.look()[1].trusted[row]
+    assert backend._keeper.state.table.accepted[row]
 
 
 def patient(problem, options, budget, check, exact):

@@ -34,23 +34,22 @@ JUDGEMENT = Judgement(np.ones(5, bool), np.zeros(5, bool), np.zeros(5), np.ones(
 MAP = Optimised(se2.identity(4), np.zeros(15), 3.0, Status.CONVERGED, 0)
 EMPTY = MapState.beginning(0, True, Optimised.nothing(se2.identity(0)), Judgement.nothing(), 0)
 # All is done, and the front carries nothing.
-RESTED = replace(
-    MapState.beginning(7, True, MAP, JUDGEMENT, 2),
+RESTED = MapState.beginning(7, True, MAP, JUDGEMENT, 2)._replace(
     carried=Carried(rows=5, taken=0, closed=False, keyframes=4, border=0, variance=np.ones(2)))
-RESTED = replace(RESTED, judged=replace(RESTED.judged, compared=MAP, took=1.0, ended=NOW - 1.5))
+RESTED = RESTED._replace(judged=replace(RESTED.judged, compared=MAP, took=1.0, ended=NOW - 1.5))
 
 
 def with_front(**changes):
-    return replace(RESTED, carried=RESTED.carried._replace(**changes))
+    return RESTED._replace(carried=RESTED.carried._replace(**changes))
 
 
 def with_judge(state=RESTED, **changes):
-    return replace(state, judged=replace(state.judged, **changes))
+    return state._replace(judged=replace(state.judged, **changes))
 
 
-MET = replace(with_front(closed=True), made=NOW - 1.0)
-PENDING = replace(RESTED, pending=JUDGEMENT)
-UNFINISHED = replace(RESTED, optimised=replace(MAP, status=Status.OUT_OF_TIME))
+MET = with_front(closed=True)._replace(made=NOW - 1.0)
+PENDING = RESTED._replace(pending=JUDGEMENT)
+UNFINISHED = RESTED._replace(optimised=replace(MAP, status=Status.OUT_OF_TIME))
 DOUBTED = with_judge(loops=2, anew=1, doubted=2, anew_ended=NOW - 5.0, anew_took=1.0)
 
 TABLE = {
@@ -69,7 +68,7 @@ TABLE = {
     'but not so many loops that the next one is dear': (
         with_front(taken=10, keyframes=4000, border=601), ONE_MORE, BUSY, Work.ROUND, None),
     'the front is closed': (with_front(closed=True), ONE_MORE, BUSY, Work.ROUND, None),
-    'there is no front': (replace(RESTED, carried=None), ONE_MORE, BUSY, Work.ROUND, None),
+    'there is no front': (RESTED._replace(carried=None), ONE_MORE, BUSY, Work.ROUND, None),
     'a judgement waits for its map': (PENDING, SIZE, BUSY, Work.ROUND, None),
     'a judgement waits for its map, at rest': (PENDING, SIZE, IDLE, Work.ROUND, None),
     'the map is of all, but not at its optimum': (UNFINISHED, SIZE, BUSY, None, None),
@@ -104,7 +103,7 @@ TABLE = {
     'the map that was judged first comes before a judgement anew': (
         with_judge(PENDING, anew=1), SIZE, IDLE, Work.ROUND, None),
     'where nothing is doubted, nothing is judged': (
-        replace(with_judge(compared=None), robust=False), ONE_MORE_LOOP, BUSY, None, None),
+        with_judge(compared=None)._replace(robust=False), ONE_MORE_LOOP, BUSY, None, None),
 }
 
 

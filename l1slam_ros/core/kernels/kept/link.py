@@ -31,10 +31,8 @@ from l1slam_ros.core.kernels.kept import objects
 # Types of numbers that numba takes for such, too.
 _NUMBERS = {'int64': frozenset((int, np.int64)), 'float64': frozenset((float, np.float64)),
             'float32': frozenset((np.float32,))}
-# What an argument has to be: its type of entries if it is an array, its dimensions or, of a tuple,
-# its length; the types of a number, or of the entries of a tuple.
-Wanted = tuple[np.dtype | None, int, frozenset[type]]
-Linked = tuple[tuple[Wanted, ...], Callable[..., Any]]
+# A version: how many arguments it has, whether it takes these, and itself.
+Linked = tuple[int, Callable[..., bool], Callable[..., Any]]
 
 # Files that were read, by step; what is linked, as it must never be freed.
 _read: dict[str, dict[str, list[objects.Kept]]] = {}
@@ -81,13 +79,31 @@ def _linked(module: ModuleType, name: str, kept: objects.Kept) -> Linked:
         raise ImportError(kept.entry)
     ctypes.c_void_p.from_address(where).value = id(environment)
     function = helpers['_dynfunc'].make_function(module, name, '', entry, environment, (engine,))
-    return tuple(_wanted(*argument) for argument in kept.takes), function
+    return len(kept.takes), _fit(kept.takes), function
 
 
-def _wanted(what: str, entries: str, count: int) -> Wanted:
-    if what == 'array':
-        return np.dtype(entries), count, frozenset()
-    return None, count if what == 'tuple' else -1, _NUMBERS[entries]
+def _fit(takes: list[tuple[str, str, int]]) -> Callable[..., bool]:
+    """
+    Return a function that tells whether arguments are of these types, see `Kept`.
+
+    It is made as one expression: to go through the arguments takes four times as long, which is
+    longer than most loops that an update calls.
+    """
+    names = [f'a{place}' for place in range(len(takes))]
+    types: dict[str, object] = {'array': np.ndarray}
+    tests = []
+    for a, (what, entries, count) in zip(names, takes, strict=True):
+        of = f'of_{a}'
+        types[of] = np.dtype(entries) if what == 'array' else _NUMBERS[entries]
+        if what == 'array':  # in C order, aligned and writable
+            tests.append(f'type({a}) is array and {a}.ndim == {count:d} and '
+                         f'({a}.dtype is {of} or {a}.dtype == {of}) and {a}.flags.carray')
+        elif what == 'tuple':
+            tests.append(f'type({a}) is tuple and len({a}) == {count:d} and '
+                         f'{of}.issuperset(map(type, {a}))')
+        else:
+            tests.append(f'type({a}) in {of}')
+    return eval(f'lambda {", ".join(names)}: {" and ".join(tests)}', types)
 
 
 def _helpers() -> dict[str, ModuleType]:

@@ -24,7 +24,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import NamedTuple
 
 from l1slam_ros.core.bordered.front import MOST_ROWS, Front, Look
 from l1slam_ros.core.errors import Interrupted
@@ -35,9 +34,10 @@ from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.improve import Improvement
+from l1slam_ros.core.running.keeper.revisions import Revisions
 from l1slam_ros.core.running.keeper.schedule import Size
 from l1slam_ros.core.running.keeper.workers import PoliteLock
-from l1slam_ros.core.running.map_state import Carried, MapState
+from l1slam_ros.core.running.map_state import Carried, MapState, Transition
 from l1slam_ros.core.running.map_to_odom import MapToOdom, Newest, move_all
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.robot_maps import Joins, Seen, map_ends
@@ -47,26 +47,8 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 # Number of factors that a front takes while its lock is held and before the clock is read; one if
 # the front has so many rows that a loop takes milliseconds.
 _AT_ONCE, _LONG = 4, MOST_ROWS // 4
-
-
-class Revisions(NamedTuple):
-    """
-    The revision, which counts the changes of a back end, now and at some earlier changes.
-
-    now : the latest; map : when the poses of the map last changed; grown : when the graph last
-    grew; graph : when the graph began, which names it
-    """
-
-    now: int = 0
-    map: int = 0
-    grown: int = 0
-    graph: int = 0
-
-    def after(self, map: bool = False, grown: bool = False, graph: bool = False) -> 'Revisions':
-        """Return the revisions after one more change; changes : which ones it sets."""
-        now = self.now + 1
-        return Revisions(now, now if map else self.map, now if grown else self.grown,
-                         now if graph else self.graph)
+# How often the next state is worked out without a lock before it is with all.
+_TRIES = 3
 
 
 class Keeper:
@@ -321,15 +303,14 @@ class Keeper:
         ends = map_ends(seen, improvement.poses, front, improvement.judgement.accepted)
         carried = Carried.by(front) if front else None
         former = self._front
-        with self._front_lock, self._graph_lock:
-            state = self._state
-            if state.began != improvement.map:
-                raise Interrupted
-            self._state = state.adopted(
-                improvement, carried, looks, pending, self._builder.graph.between,
-                self._solver.outer_tolerance, time.monotonic())
+        tolerance = self._solver.outer_tolerance
+
+        def publish() -> None:
             self._front = front
             self._move(ends)
+
+        self.change(improvement.map, lambda state, factors: state.adopted(
+            improvement, carried, looks, pending, factors, tolerance, time.monotonic()), publish)
         # To free its memory takes long, so an update must not hold the last reference.
         with self._front_lock:
             pass
@@ -341,18 +322,34 @@ class Keeper:
             self._state = self._state.being_judged(time.monotonic())
             return now, self._revisions.grown
 
-    def change(self, made_for: Snapshot,
-               transition: Callable[[MapState, BetweenFactors], MapState]) -> None:
+    def change(self, began: int, transition: Transition,
+               publish: Callable[[], None] = lambda: None) -> None:
         """
-        Replace the state by `transition` of it; made_for : the snapshot that the result is of.
+        Replace the state by `transition` of it; publish : called then, with both locks.
+
+        That takes milliseconds where the graph is large, so it is worked out without a lock, and
+        again where the state has changed meanwhile; at last with both. began : names the map.
 
         Raises
         ------
-        Interrupted : another map has begun since the snapshot.
+        Interrupted : another map has begun.
 
         """
+        for _ in range(_TRIES):
+            state, factors, _ = self.look()
+            if state.began != began:
+                raise Interrupted
+            found = transition(state, factors)
+            with self._front_lock, self._graph_lock:
+                if self._state is state:
+                    # Of factors that were there already, a person may have said something since.
+                    now = self._builder.graph.between
+                    self._state = found if now is factors else found.told(now)
+                    self._revisions = self._revisions.after()
+                    return publish()
         with self._front_lock, self._graph_lock:
-            if self._state.began != made_for.map:
+            if self._state.began != began:
                 raise Interrupted
             self._state = transition(self._state, self._builder.graph.between)
             self._revisions = self._revisions.after()
+            publish()

@@ -119,8 +119,10 @@ class Updates:
         This is so if more factors came than it could take, and they are being judged or mapped:
         the front would soon be replaced, and its work would delay theirs.
         """
+        if not self._workers.judge.busy and self._keeper.state.pending is None:
+            return False
         state, _, size = self._keeper.look()
-        return outrun(state, size) and (self._workers.judge.busy or state.pending is not None)
+        return outrun(state, size)
 
     def _account(self, began: int, took: float) -> Improvement:
         state, _, size = self._keeper.look()

@@ -119,11 +119,11 @@ def compare_norms(keeper: Keeper, check: Check) -> None:
     problem = as_one(turned)
     found = doubts_of_norm(problem.graph, problem.judgement, problem.poses, check)
     doubts = replace(problem.judgement, doubts=found).renumbered(order).doubts
-    keeper.change(now, lambda state, _: state.doubted(now.state, doubts))
+    keeper.change(now.map, lambda state, _: state.doubted(now.state, doubts))
 
 
 def take_judgement(keeper: Keeper, of: Snapshot, judgement: Judgement, poses: Array,
                    anew: bool) -> None:
     """Hand in the judgement of a snapshot and its L2 map (n, p); anew : from the graph alone."""
-    keeper.change(of, lambda state, factors: state.judged_by(
+    keeper.change(of.map, lambda state, factors: state.judged_by(
         judgement, poses, len(of.loop_rows), anew, factors, time.monotonic()))
