@@ -159,14 +159,16 @@ def keep(step: str) -> list[str]:
     module = import_module(objects.module_of(step))
     attribute = 'takes_in_space' if step.endswith(objects.SPACE) else 'takes'
     kept, folders = {}, set()
-    for kernel in vars(module).values():
-        if takes := getattr(kernel, attribute, ()):
-            dispatcher = kernel.dispatcher
-            # What numba reads back it does not give away.
-            dispatcher._cache.load_overload = lambda *_: None
-            versions = [_compile(dispatcher, one) for one in takes]
-            folders.add(dispatcher.stats.cache_path)
-            kept[kernel.py_func.__name__] = versions
+    kernels = {name: kernel for name, kernel in vars(module).items()
+               if isinstance(kernel, Loop) and not _is_own(name)}
+    with make.code_only_of(kernels.keys()):
+        for of, kernel in kernels.items():
+            if takes := getattr(kernel, attribute):
+                dispatcher = kernel.dispatcher
+                # What numba reads back it does not give away.
+                dispatcher._cache.load_overload = lambda *_: None
+                kept[of] = [_compile(dispatcher, one) for one in takes]
+                folders.add(dispatcher.stats.cache_path)
     name = module.__name__.rpartition('.')[2]
     beside = sorted(str(file) for folder in folders - {None}
                     for file in Path(folder).glob(f'{name}.*.nbi'))
@@ -193,7 +195,7 @@ def _dispatcher(function: Kernel, brief: bool) -> Any:
     import numba
 
     _spare_blas()
-    own = function.__name__.startswith('_')
+    own = _is_own(function.__name__)
     # After an upgrade numba would keep what this process has under the source that is there now.
     as_imported = objects.is_as_imported(_source(function))
     options = {'nogil': not brief, 'error_model': 'numpy',
@@ -203,6 +205,11 @@ def _dispatcher(function: Kernel, brief: bool) -> Any:
         return numba.njit(cache=as_imported and not own, **options)(function)
     except RuntimeError:
         return numba.njit(**options)(function)
+
+
+def _is_own(name: str) -> bool:
+    """Tell whether only its own module calls a function, by its name."""
+    return name.startswith('_')
 
 
 def _source(function: Kernel) -> Path:
