@@ -51,6 +51,8 @@ class Loop:
     takes_in_space : those of the versions that only graphs in space need
     brief : it keeps the interpreter's lock. Whoever lets go of it, for however short a time, may
         have to wait until a thread that has taken it meanwhile lets go of it in turn
+    as_written : the functions of its module are optimised where they are called, and not before,
+        one by one. Of tiles that are written by vectors that leaves more in registers
 
     Attributes
     ----------
@@ -59,13 +61,15 @@ class Loop:
     """
 
     def __init__(self, py_func: Kernel, takes: tuple[str, ...] = (),
-                 takes_in_space: tuple[str, ...] = (), brief: bool = False) -> None:
+                 takes_in_space: tuple[str, ...] = (), brief: bool = False,
+                 as_written: bool = False) -> None:
         update_wrapper(self, py_func)
         objects.note_import(_source(py_func))
         self.py_func = py_func
         self.takes = takes
         self.takes_in_space = takes_in_space
         self.brief = brief
+        self.as_written = as_written
         self.linked: tuple[link.Linked, ...] = ()
         self._sought: dict[bool, bool] = {}
         self._dispatcher: Any = None
@@ -130,10 +134,10 @@ class Loop:
 compiled = Loop
 
 
-def loop(*takes: str, space: tuple[str, ...] = (), brief: bool = False) -> Callable[
-        [Kernel], Loop]:
+def loop(*takes: str, space: tuple[str, ...] = (), brief: bool = False,
+         as_written: bool = False) -> Callable[[Kernel], Loop]:
     """Return what makes a function that the interpreter calls a `Loop`."""
-    return lambda function: Loop(function, takes, space, brief)
+    return lambda function: Loop(function, takes, space, brief, as_written)
 
 
 def for_sizes(takes: str, plane: tuple[str, ...] = ('UniTuple(i8, 3)',)) -> Callable[
@@ -161,7 +165,8 @@ def keep(step: str) -> list[str]:
     kept, folders = {}, set()
     kernels = {name: kernel for name, kernel in vars(module).items()
                if isinstance(kernel, Loop) and not _is_own(name)}
-    with make.code_only_of(kernels.keys()):
+    as_written = any(kernel.as_written for kernel in kernels.values())
+    with make.code_only_of(kernels.keys(), as_written):
         for of, kernel in kernels.items():
             if takes := getattr(kernel, attribute):
                 dispatcher = kernel.dispatcher

@@ -29,15 +29,19 @@ _OWN = frozenset(('nrt', 'multi3'))
 
 
 @contextmanager
-def code_only_of(entries: Set[str]) -> Iterator[None]:
+def code_only_of(entries: Set[str], as_written: bool) -> Iterator[None]:
     """
     Let numba make machine code of no other functions while it compiles these.
 
     It would of each function that one of these calls, too, though the caller has a copy of it, and
-    that takes a tenth of the time.
+    that takes a tenth of the time. as_written : see `compiled.Loop`
     """
     library, owner = codegen.JITCodeLibrary, codegen.JITCPUCodegen
-    finish, set_environment = library._finalize_final_module, owner.set_env
+    optimise, finish = library._optimize_functions, library._finalize_final_module
+    set_environment = owner.set_env
+
+    def left(self: Any, module: Any) -> None:
+        module.data_layout = self._codegen._data_layout
 
     def finished(self: Any) -> None:
         if self.name in entries or self.name in _OWN:
@@ -50,11 +54,13 @@ def code_only_of(entries: Set[str]) -> Iterator[None]:
         if self._engine.is_symbol_defined(name):
             set_environment(self, name, environment)
 
+    library._optimize_functions = left if as_written else optimise
     library._finalize_final_module, owner.set_env = finished, set_where_it_is
     try:
         yield
     finally:
-        library._finalize_final_module, owner.set_env = finish, set_environment
+        library._optimize_functions, library._finalize_final_module = optimise, finish
+        owner.set_env = set_environment
 
 
 def taken_apart(compiled: Any) -> objects.Kept:
