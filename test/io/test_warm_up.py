@@ -19,6 +19,7 @@ import pytest
 from work import WORK
 
 from l1slam_ros.core import kernels
+from l1slam_ros.core.kernels import growth
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io import compilation
 from l1slam_ros.io.compilation import IN_SPACE, STEPS, fill_cache
@@ -108,9 +109,10 @@ def test_only_what_is_needed_is_read(world, what, most_loops, missing):
 
 
 def test_every_module_of_loops_is_a_step():
-    """But for those in folders of their own, as of what only large graphs need."""
+    """But for those that only large graphs need."""
     modules = {module.name for module in pkgutil.iter_modules(kernels.__path__)
                if not module.ispkg}
+    modules |= {f'growth.{module.name}' for module in pkgutil.iter_modules(growth.__path__)}
     steps = {step.split(':')[0] for step in (*STEPS, *IN_SPACE.values())}
     assert steps == modules - {'compiled'}
     assert set(STEPS) == {*compilation.SPARSE, *compilation.JUDGEMENT, *compilation.DENSE,

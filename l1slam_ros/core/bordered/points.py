@@ -61,13 +61,13 @@ class PointsNow:
         """Return m + C g of all keyframes, old and new, (n + b, k); gradient : g, (t, k)."""
         gradient = gradient.copy()
         points, keyframes = self.old
-        kernels.substitution.pull_parents(self.parent, self.turn, gradient)
+        kernels.growth.pull_parents(self.parent, self.turn, gradient)
         right = np.zeros((self.size, gradient.shape[1]))
         right[keyframes] = gradient[points]
         old = self.cholesky.solve(right.ravel()) if len(points) else right
         moved = np.zeros_like(gradient)
         moved[points] = old.reshape(right.shape)[keyframes]
-        kernels.substitution.move_children(
+        kernels.growth.move_children(
             self.parent, self.turn, self.noise, gradient, moved)
         return np.concatenate((old.reshape(right.shape), (self.mean + moved)[self.new]))
 

@@ -88,7 +88,7 @@ _pack_wide, _pack_narrow = (Inline(_pack_tile, lanes) for lanes in (_WIDE, _NARR
 _solve_wide, _solve_narrow = (Inline(_solve_tile, lanes) for lanes in (_WIDE, _NARROW))
 
 
-@loop(f'({_PANELS}, i4[::1], i1[::1], i8, i4[:, ::1], i8[::1], i8)')
+@loop(f'({_PANELS}, i4[::1], i1[::1], i8, i4[:, ::1], i8[::1], i8)', as_written=True)
 def factorise(panels, first, start, pattern, offset, stride, owner, share, mine, lists, reach, d):
     """
     Turn the lower triangle in `panels` into its Cholesky factor, for one share of the supernodes.

@@ -49,6 +49,8 @@ class Loop:
     takes_in_space : those of the versions that only graphs in space need
     brief : it keeps the interpreter's lock. Whoever lets go of it, for however short a time, may
         have to wait until a thread that has taken it meanwhile lets go of it in turn
+    as_written : the functions of its module are optimised where they are called, and not before,
+        one by one. Of tiles that are written by vectors that leaves more in registers
 
     Attributes
     ----------
@@ -57,13 +59,15 @@ class Loop:
     """
 
     def __init__(self, py_func: Kernel, takes: tuple[str, ...] = (),
-                 takes_in_space: tuple[str, ...] = (), brief: bool = False) -> None:
+                 takes_in_space: tuple[str, ...] = (), brief: bool = False,
+                 as_written: bool = False) -> None:
         update_wrapper(self, py_func)
         objects.note_import(_source(py_func))
         self.py_func = py_func
         self.takes = takes
         self.takes_in_space = takes_in_space
         self.brief = brief
+        self.as_written = as_written
         self.linked: tuple[link.Linked, ...] = ()
         self._sought: dict[bool, bool] = {}
         self._dispatcher: Any = None
@@ -114,10 +118,10 @@ class Loop:
 compiled = Loop
 
 
-def loop(*takes: str, space: tuple[str, ...] = (), brief: bool = False) -> Callable[
-        [Kernel], Loop]:
+def loop(*takes: str, space: tuple[str, ...] = (), brief: bool = False,
+         as_written: bool = False) -> Callable[[Kernel], Loop]:
     """Return what makes a function that the interpreter calls a `Loop`."""
-    return lambda function: Loop(function, takes, space, brief)
+    return lambda function: Loop(function, takes, space, brief, as_written)
 
 
 def for_sizes(takes: str, plane: tuple[str, ...] = ('UniTuple(i8, 3)',)) -> Callable[
@@ -143,14 +147,17 @@ def keep(step: str) -> list[str]:
     module = import_module(objects.module_of(step))
     attribute = 'takes_in_space' if step.endswith(objects.SPACE) else 'takes'
     kept, folders = {}, set()
-    for kernel in vars(module).values():
-        if takes := getattr(kernel, attribute, ()):
-            dispatcher = kernel.dispatcher
-            # What numba reads back it does not give away.
-            dispatcher._cache.load_overload = lambda *_: None
-            versions = [_compile(dispatcher, one) for one in takes]
-            folders.add(dispatcher.stats.cache_path)
-            kept[kernel.py_func.__name__] = versions
+    kernels = {name: kernel for name, kernel in vars(module).items()
+               if isinstance(kernel, Loop) and not _is_own(name)}
+    as_written = any(kernel.as_written for kernel in kernels.values())
+    with make.code_only_of(kernels.keys(), as_written):
+        for of, kernel in kernels.items():
+            if takes := getattr(kernel, attribute):
+                dispatcher = kernel.dispatcher
+                # What numba reads back it does not give away.
+                dispatcher._cache.load_overload = lambda *_: None
+                kept[of] = [_compile(dispatcher, one) for one in takes]
+                folders.add(dispatcher.stats.cache_path)
     name = module.__name__.rpartition('.')[2]
     beside = sorted(str(file) for folder in folders - {None}
                     for file in Path(folder).glob(f'{name}.*.nbi'))
@@ -177,7 +184,7 @@ def _dispatcher(function: Kernel, brief: bool) -> Any:
     import numba
 
     _spare_blas()
-    own = function.__name__.startswith('_')
+    own = _is_own(function.__name__)
     # After an upgrade numba would keep what this process has under the source that is there now.
     as_imported = objects.is_as_imported(_source(function))
     options = {'nogil': not brief, 'error_model': 'numpy',
@@ -187,6 +194,11 @@ def _dispatcher(function: Kernel, brief: bool) -> Any:
         return numba.njit(cache=as_imported and not own, **options)(function)
     except RuntimeError:
         return numba.njit(**options)(function)
+
+
+def _is_own(name: str) -> bool:
+    """Tell whether only its own module calls a function, by its name."""
+    return name.startswith('_')
 
 
 def _source(function: Kernel) -> Path:

@@ -44,7 +44,7 @@ def minimum_degree(start, adjacent, limit, stage, order_begun, column_begun, row
     ways round, k itself left out; int32.
     stage : (n,) from 0; nodes of a higher one come later, whatever their degree
     order_begun, column_begun, rows_begun : as returned, of the first nodes to eliminate: none, or
-        what `symbolic.untouched` left of an elimination
+        what `growth.untouched` left of an elimination
 
     Returns
     -------

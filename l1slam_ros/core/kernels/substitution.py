@@ -9,8 +9,6 @@
 """
 Solving with the factor that `cholesky` left in the panels, forwards and backwards.
 
-So with what hangs on points of a border, each on one before it; see `border`.
-
 Rows of a panel are taken three at a time, so that what is read of the solution serves all three.
 """
 
@@ -97,25 +95,3 @@ def _backward(panel, stride, place, own, x):
         own[r] /= row[r]
         for c in range(r):
             own[c] -= row[c] * own[r]
-
-
-@loop('(i8[::1], f8[:, :, ::1], f8[:, ::1])')
-def pull_parents(parent, turn, gradient):
-    """Let what pulls at points, (t, k), pull at what they hang on, too."""
-    for s in range(len(parent) - 1, -1, -1):
-        if parent[s] >= 0:
-            for r in range(gradient.shape[1]):
-                for c in range(gradient.shape[1]):
-                    gradient[parent[s], c] += turn[s, r, c] * gradient[s, r]
-
-
-@loop('(i8[::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1])')
-def move_children(parent, turn, noise, gradient, moved):
-    """Write how far from their means points are that hang on others, (t, k)."""
-    k = moved.shape[1]
-    for s in range(len(parent)):
-        for r in range(k):
-            for c in range(k):
-                moved[s, r] += noise[s, r, c] * gradient[s, c]
-                if parent[s] >= 0:
-                    moved[s, r] += turn[s, r, c] * moved[parent[s], c]

@@ -132,7 +132,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
     """
     graph = neighbours(keyframe, size)
     if before is not None and before.found <= size < GROWN * before.found:
-        begun = kernels.symbolic.untouched(*graph, *before.columns)
+        begun = kernels.growth.untouched(*graph, *before.columns)
         pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), begun, before.found)
         if pattern is not None and pattern.blocks <= most_blocks:
             return pattern

@@ -268,6 +268,29 @@ print(*compilation.make('interior_point'), time.process_time() - before)
 """
 
 
+# Makes a step; prints the functions of which numba made machine code.
+NOTED = """
+from l1slam_ros.core.kernels import compiled
+from numba.core import codegen
+
+def noted(library):
+    made.add(library.name)
+    finish(library)
+
+made, finish = set(), codegen.JITCodeLibrary._finalize_specific
+codegen.JITCodeLibrary._finalize_specific = noted
+assert compiled.keep('se2')
+print(*sorted(made - {'nrt'}))
+"""
+
+
+def test_what_only_loops_call_has_no_machine_code_of_its_own(tmp_path):
+    said = subprocess.run([sys.executable, '-c', NOTED], check=True, text=True,
+                          stdout=subprocess.PIPE,
+                          env={**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)}).stdout
+    assert said.split() == ['curvature', 'jacobians', 'residual']
+
+
 def test_two_who_make_the_same_at_once_make_it_once(tmp_path):
     both = [subprocess.Popen([sys.executable, '-c', MAKE], stdin=subprocess.PIPE, text=True,
                              stdout=subprocess.PIPE, env={**os.environ, 'NUMBA_CACHE_DIR':

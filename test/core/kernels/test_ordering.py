@@ -20,7 +20,8 @@ from systems import PLENTY, SHAPES
 
 from l1slam_ros.core.kernels import dissection, ordering
 from l1slam_ros.core.kernels.dissection import coarsening, separators
-from l1slam_ros.core.kernels.symbolic import postorder, untouched
+from l1slam_ros.core.kernels.growth import untouched
+from l1slam_ros.core.kernels.symbolic import postorder
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 NOTHING = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32)

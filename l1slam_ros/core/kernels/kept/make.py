@@ -9,9 +9,12 @@
 """What numba compiles, taken apart so that it runs without numba; used where numba compiles."""
 
 import struct
+from collections.abc import Iterator, Set
+from contextlib import contextmanager
 from typing import Any
 
 from numba import types
+from numba.core import codegen
 from numba.np import numpy_support
 
 from l1slam_ros.core.kernels.kept import objects
@@ -21,6 +24,43 @@ _HEAD = '<16sHHIQQQIHHHHHH'
 _SECTION = '<IIQQQQIIQQ'
 _SYMBOL = '<IBBHQQ'
 _SYMBOLS = 2  # type of the section with the symbols
+# Numba's own modules, which it calls itself.
+_OWN = frozenset(('nrt', 'multi3'))
+
+
+@contextmanager
+def code_only_of(entries: Set[str], as_written: bool) -> Iterator[None]:
+    """
+    Let numba make machine code of no other functions while it compiles these.
+
+    It would of each function that one of these calls, too, though the caller has a copy of it, and
+    that takes a tenth of the time. as_written : see `compiled.Loop`
+    """
+    library, owner = codegen.JITCodeLibrary, codegen.JITCPUCodegen
+    optimise, finish = library._optimize_functions, library._finalize_final_module
+    set_environment = owner.set_env
+
+    def left(self: Any, module: Any) -> None:
+        module.data_layout = self._codegen._data_layout
+
+    def finished(self: Any) -> None:
+        if self.name in entries or self.name in _OWN:
+            finish(self)
+        else:
+            self._finalize_dynamic_globals()
+            self._finalized = True
+
+    def set_where_it_is(self: Any, name: str, environment: Any) -> None:
+        if self._engine.is_symbol_defined(name):
+            set_environment(self, name, environment)
+
+    library._optimize_functions = left if as_written else optimise
+    library._finalize_final_module, owner.set_env = finished, set_where_it_is
+    try:
+        yield
+    finally:
+        library._optimize_functions, library._finalize_final_module = optimise, finish
+        owner.set_env = set_environment
 
 
 def taken_apart(compiled: Any) -> objects.Kept:

@@ -34,7 +34,7 @@ import numpy as np
 
 KERNELS = Path(__file__).parents[1]
 _CORE = __name__.removesuffix('.kernels.kept.objects')
-# A step is the name of a module of `kernels`, or the path in `core` of another one; and with this
+# A step is the path in `kernels` of a module, or the path in `core` of another one; and with this
 # at its end: the versions for space of its loops.
 SPACE = ':space'
 # Extension modules of numba's that hold what its machine code calls: where they are in it.
@@ -171,7 +171,8 @@ def step_of(module: str, space: bool) -> str:
 def module_of(step: str) -> str:
     """Return the full name of the module that has the loops of a step."""
     name = step.removesuffix(SPACE)
-    return f'{_CORE}.{name}' if '.' in name else f'{_CORE}.kernels.{name}'
+    is_elsewhere = '.' in name and not (KERNELS / name.partition('.')[0]).is_dir()
+    return f'{_CORE}.{name}' if is_elsewhere else f'{_CORE}.kernels.{name}'
 
 
 def sources() -> dict[str, tuple[int, int]]:
