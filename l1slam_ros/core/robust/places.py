@@ -22,7 +22,6 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.geometry.quantiles import gamma_quantile
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest_of_components
 from l1slam_ros.core.graph.linear_system import with_world
-from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.core.robust.innovation import BY_CHANCE
 
 # Linked are loops whose ends lie within so many metres along the way, in sum, or within the length
@@ -94,23 +93,6 @@ def mates(place: Indices, ends: Array) -> tuple[Indices, Indices]:
     same = place[one] == place[other]
     one, other = one[same], other[same]
     return np.concatenate((one, other)), np.concatenate((other, one))
-
-
-def join_what_no_other(place: Indices, parts: Indices, joins: Mask) -> Mask:
-    """
-    Return which places have a loop between two parts that no accepted loop elsewhere joins.
-
-    place : (m,) of each loop; parts : (2, m) that it joins, the lower first; joins : (m,) accepted
-    """
-    _, pair = np.unique(
-        pair_key(parts[0], parts[1], parts.max(initial=0) + 1), return_inverse=True)
-    alone = np.zeros(place.max(initial=-1) + 1, bool)
-    accepted = np.bincount(pair[joins], minlength=len(pair))
-    of_place = place * (len(pair) + 1) + pair
-    _, number = np.unique(of_place, return_inverse=True)
-    here = np.bincount(number, joins, len(pair))
-    alone[place[accepted[pair] == here[number]]] = True
-    return alone
 
 
 def beside_refused(pairs: tuple[Indices, Indices], refused: Mask, true: Mask) -> Array:
