@@ -62,8 +62,6 @@ _NOISE = np.logspace(-3, 3, 13)
 _ROUNDS = 12
 # So many loops are asked at most.
 _ASKED = 500
-# The density of a lie's turn.
-_EVEN = 1 / (2 * np.pi)
 
 
 def likely_drifts(graph: FactorGraph) -> Array:
@@ -185,7 +183,8 @@ class _DriftLikelihood:
             variance = self.own[:, 2, 2] + q * turns + (metres * step) ** 2 / 12
             even = np.where(variance > np.pi**2 / 3, 1.0, 0.0)
             ratio = np.exp(square * (-1 / variance).astype(np.float32))
-            ratio *= (1 / np.sqrt(2 * np.pi * variance) / _EVEN).astype(np.float32)
+            # A lie's turn has the density 1 / (2 pi).
+            ratio *= np.sqrt(2 * np.pi / variance).astype(np.float32)
             # All around the circle, what is wider than it is even.
             np.maximum(ratio, even.astype(np.float32), out=ratio)
             values.append(_log_likelihood(ratio, self.weight) + log_prior(

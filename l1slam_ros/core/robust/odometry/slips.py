@@ -24,6 +24,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.robust.gating import DOUBT
+from l1slam_ros.core.robust.inspection import FEWEST
 from l1slam_ros.core.robust.odometry.cuts import put_back, settled, unusual, without
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
@@ -40,8 +41,6 @@ from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 _TRIED = 2
 # What is nearly sure: ln of the odds.
 SURE = float(np.log(1 / DOUBT - 1))
-# Of fewer steps there is no habit.
-_FEWEST_STEPS = 20
 
 
 def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
@@ -54,7 +53,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     """
     growth.slip_odds = {
         step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
-    if np.count_nonzero(~growth.given.is_loop & ~growth.cut) < _FEWEST_STEPS:
+    if np.count_nonzero(~growth.given.is_loop & ~growth.cut) < FEWEST:
         return None
     motion = usual_motion(growth)
     odds = log_odds_of_slips(growth, motion)
