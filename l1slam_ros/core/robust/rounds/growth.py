@@ -52,6 +52,8 @@ _TAIL = 2.0
 # dropped for it, by the median of factors that others check at all.
 _NOISIER = 3.0
 _CHECKED = 0.01
+# So often noise is learnt anew of other factors: each time half of what it was before may stay.
+_LEARNT_ANEW = 8
 # While driving so many of the last absolute factors are looked at, with their neighbours.
 _LATEST = 50
 # The variance of an odometry factor that was cut, in units of its own: loops alone decide, and far
@@ -237,9 +239,9 @@ class Growth:
             self.fits_found[tail] = True
             self.accept_more()
 
-    def learn_noise_anew(self, times: int) -> None:
+    def learn_noise_anew(self) -> None:
         """Solve, and learn the noise of what is accepted now alone, again and again."""
-        for _ in range(times):
+        for _ in range(_LEARNT_ANEW):
             self.noise = self.noise.forgotten()
             self.solve()
 
