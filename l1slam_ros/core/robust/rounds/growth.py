@@ -25,6 +25,7 @@ from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.gating import DOUBT, believable, noise_variance
 from l1slam_ros.core.robust.innovation import (
+    CHECKED,
     LEAST_RATIO,
     Innovations,
     Posterior,
@@ -49,9 +50,8 @@ _CHANCES = 2
 # squares.
 _TAIL = 2.0
 # Noise that is so many times the variance that was found is measured anew before any loop is
-# dropped for it, by the median of factors that others check at all.
+# dropped for it, by the median of factors that others check.
 _NOISIER = 3.0
-_CHECKED = 0.01
 # So often noise is learnt anew of other factors: each time half of what it was before may stay.
 _LEARNT_ANEW = 8
 # While driving so many of the last absolute factors are looked at, with their neighbours.
@@ -277,7 +277,7 @@ class Growth:
             return False
         square = (self.posterior.residual**2).sum(axis=1)
         stated = np.trace(self.posterior.moment, axis1=1, axis2=2)
-        known = (stated > _CHECKED) & ~self.given.factors.is_absolute[rows]
+        known = (stated > CHECKED) & ~self.given.factors.is_absolute[rows]
         scale = np.array([np.median(square[known & kind] / stated[known & kind])
                           if (known & kind).any() else 0.0 for kind in (~loops, loops)])
         k = self.given.graph.manifold.TANGENT_SIZE
