@@ -41,15 +41,16 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.gating import TINY
+from l1slam_ros.core.robust.pairwise_consistency import ASKED
 from l1slam_ros.core.robust.places import places
 
 # [rad/m] What wheels and gyros drift by: its standard deviation, and the most that is looked for.
 USUAL, _MOST = 0.03, 0.18
-# [rad/m] Drifts are looked for so far apart; near so many of the likeliest, so many times as near,
-# until the longest loop tells them apart by no more than so much [rad].
+# [rad/m] Drifts are looked for so far apart; near so many of the likeliest, twice as near
+# each time, until the longest loop tells them apart by no more than so much [rad].
 _STEP = 0.0008
 _PEAKS = 40
-_FINER, _FINE = 5, 0.02
+_FINE = 0.02
 # Nearly as likely as the likeliest is none with this part of its odds to all loops being lies, and
 # worth a look another drift: loops of a lap share much of their errors, so that odds are less than
 # they seem. So many are looked at most.
@@ -60,8 +61,6 @@ _TRIED = 8
 _NOISE = np.logspace(-3, 3, 13)
 # Rounds of expectation and maximisation of the share of true loops.
 _ROUNDS = 12
-# So many loops are asked at most.
-_ASKED = 500
 
 
 def likely_drifts(graph: FactorGraph) -> Array:
@@ -74,7 +73,7 @@ def likely_drifts(graph: FactorGraph) -> Array:
     rows = np.flatnonzero(~graph.between.is_odometry & ~graph.between.is_absolute)
     if graph.manifold is not se2 or not len(rows):
         return np.zeros(0)
-    rows = rows[:: max(1, len(rows) // _ASKED)]
+    rows = rows[:: max(1, len(rows) // ASKED)]
     likelihood = _drift_likelihood(bridged(graph), rows)
     drifts = likelihood.peaks()
     values = np.array([likelihood.value(drift, USUAL**2) for drift in drifts])
@@ -156,8 +155,8 @@ class _DriftLikelihood:
         step = _STEP
         metres = float(self._headings[0].max())
         while step * metres > _FINE:
-            near = drift + step * np.linspace(-1, 1, 2 * _FINER + 1)
-            step /= _FINER
+            step /= 2
+            near = drift + step * np.linspace(-2, 2, 5)
             drift = float(near[np.argmax(self._by_headings(near, step, np.array([q]))[0])])
         return drift
 
