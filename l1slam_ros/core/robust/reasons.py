@@ -39,7 +39,6 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     RUN,
     agree_at_a_place,
     longest_run,
-    runs,
     spanned,
     strongest_group,
 )
@@ -62,7 +61,7 @@ def doubts(growth: Growth, ended: bool = True, rival: float = 0.0) -> tuple[Doub
         reasons.append(_doubt(growth, UNFINISHED, left_out))
     if _decides_alone(growth, accepted):
         reasons.append(_doubt(growth, ONE_PLACE, accepted))
-    if growth.cut.any():
+    if growth.given.gap.any():
         reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
     agree = _agree(growth)
     reasons += _other_map(growth, agree)
@@ -97,8 +96,7 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     """
     Yield the loops of one place, accepted or not, that alone say how two parts lie to each other.
 
-    Parts are what is between two gaps, or slips that were cut. Of a slip, a run says enough: a lie
-    of many loops hardly has the robot move there as elsewhere.
+    Parts are what is between two gaps, or beside these slips that were cut.
     """
     given = growth.given
     sure = ~given.is_loop | given.trusted | given.factors.is_absolute
@@ -119,8 +117,7 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
         if joined < without:
             # Rivals that say it otherwise are of the same doubt.
             joins |= own
-            if given.gap.any() or not runs(growth, rows[own]):
-                yield rows[own]
+            yield rows[own]
 
 
 def _joining_otherwise(growth: Growth) -> Iterator[Indices]:
