@@ -50,8 +50,9 @@ _CHANCES = 2
 # squares.
 _TAIL = 2.0
 # Noise that is so many times the variance that was found is measured anew before any loop is
-# dropped for it, by the median of factors that others check.
-_NOISIER = 3.0
+# dropped for it, by the median of factors that others check; so many times what is stated, the
+# odometry may drift.
+NOISIER = 3.0
 # So often noise is learnt anew of other factors: each time half of what it was before may stay.
 _LEARNT_ANEW = 8
 # While driving so many of the last absolute factors are looked at, with their neighbours.
@@ -282,7 +283,7 @@ class Growth:
                           if (known & kind).any() else 0.0 for kind in (~loops, loops)])
         k = self.given.graph.manifold.TANGENT_SIZE
         scale *= k / chi2_quantile(0.5, np.array([k]))
-        noisier = scale > _NOISIER
+        noisier = scale > NOISIER
         self.noise = self.noise.found(np.where(noisier, scale, 1.0) * self.noise.variance)
         return bool(noisier.any())
 
