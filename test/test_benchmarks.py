@@ -18,11 +18,11 @@ from problems import linprog_l1
 
 FOLDER = Path(__file__).parents[1] / 'benchmarks'
 sys.path.append(str(FOLDER))
-cases, measuring, solvers, tables, inner, linear, ours, environment, robust, runs = (
+cases, measuring, solvers, tables, inner, linear, ours, environment, robust, runs, ablation = (
     importlib.import_module(name) for name in (
         'solvers.cases', 'measuring', 'solvers.__main__', 'solvers.tables', 'solvers.inner',
         'solvers.linear_solvers', 'solvers.ours', 'peer_environment', 'robust.tables',
-        'robust.runs'))
+        'robust.runs', 'robust.ablation'))
 
 
 @pytest.fixture(scope='module')
@@ -32,6 +32,14 @@ def problems():
 
 def recorded(part):
     return json.loads((FOLDER / 'results' / f'{part}.json').read_text())
+
+
+@pytest.mark.parametrize('rule', ablation.RULES)
+def test_what_an_ablation_leaves_out_is_a_function_of_the_judgement(rule):
+    function, holders, name = ablation.places_of(rule)
+    assert all(vars(holder)[name] is function for holder in holders)
+    assert 2 < ablation.lines_of(function) < 40
+    assert f'{name}`' in (FOLDER / 'robust' / 'SENSITIVITY.md').read_text()
 
 
 def test_what_is_said_was_measured():

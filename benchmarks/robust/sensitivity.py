@@ -109,8 +109,7 @@ class Case:
 
 def constants() -> dict[str, list[ModuleType]]:
     """Return the name of each constant, `module.NAME`, and all modules that hold it."""
-    modules = [import_module(found.name)
-               for found in walk_packages(robust.__path__, f'{robust.__name__}.')]
+    modules = modules_of_judgement()
     found: dict[str, list[ModuleType]] = {}
     for module in modules:
         for name in _assigned(module):
@@ -121,6 +120,12 @@ def constants() -> dict[str, list[ModuleType]]:
                     other for other in modules if other is not module
                     and vars(other).get(name) is value and name not in _assigned(other))]
     return found
+
+
+def modules_of_judgement() -> list[ModuleType]:
+    """Return all modules of `core.robust`."""
+    return [import_module(found.name)
+            for found in walk_packages(robust.__path__, f'{robust.__name__}.')]
 
 
 def _assigned(module: ModuleType) -> list[str]:
@@ -207,7 +212,7 @@ def _graphs(datasets: Path, drawn: int) -> Iterator[tuple[Place, FactorGraph, Ar
                 yield found, *made_wrong(found, CONDITIONS[number], generator(name, number, 0))
 
 
-def _cases(datasets: Path, drawn: int) -> list[Case]:
+def telling_cases(datasets: Path, drawn: int) -> list[Case]:
     """Return the runs that tell."""
     cases, plain = [], 0
     for found, graph, best in _graphs(datasets, drawn):
@@ -223,7 +228,7 @@ def _cases(datasets: Path, drawn: int) -> list[Case]:
     return cases
 
 
-def _compared(cases: list[Case]) -> str:
+def compared(cases: list[Case]) -> str:
     """Return in how many runs something is other than it was, better, worse, newly silent."""
     ends = [(case.ended, _ended(case.found, case.graph, case.best)) for case in cases]
     other = sum(now.found != then.found for now, then in ends)
@@ -241,7 +246,7 @@ def main() -> int:
     parser.add_argument('--drawn', type=int, default=12, help='worlds of each kind')
     parser.add_argument('--only', nargs='+', help='constants, as gating.DOUBT')
     given = parser.parse_args()
-    cases = _cases(given.datasets, given.drawn)
+    cases = telling_cases(given.datasets, given.drawn)
     now = [case.ended.outcome for case in cases]
     print(f'{len(now)} runs; right {now.count(0)}, right and doubted {now.count(1)}, wrong and '
           f'said {now.count(2)}, wrong and silent {now.count(3)}\n\n'
@@ -256,7 +261,7 @@ def main() -> int:
         telling = [case for case in cases if case.reads(short, modules)]
         for times in (0.5, 2.0):
             with changed_to(short, modules, scaled(value, times)):
-                columns.append(_compared(telling))
+                columns.append(compared(telling))
         print(f'| `{name}` | {value:.4g} | {len(telling)} | {columns[0]} | {columns[1]} |',
               flush=True)
     return 0

@@ -29,7 +29,7 @@ from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.as_measured import OnRound
 from l1slam_ros.core.robust.batch import RobustMap, minimise_robustly
 from l1slam_ros.core.robust.inspection import (
-    FEWEST_SPARE,
+    FEWEST,
     densest_part,
     initial_poses,
     lacked_step,
@@ -223,7 +223,7 @@ def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Arr
     part, keyframes, is_loop = densest_part(
         straightened(graph, judgement.drift).subset(
             rows, judgement.noise[rows] * judgement.found_variance(graph)))
-    if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < FEWEST_SPARE:
+    if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < FEWEST:
         return None
     cholesky = cholesky_of(part)
     system = linearise(part, poses[keyframes])

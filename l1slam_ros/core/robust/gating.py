@@ -53,6 +53,7 @@ TINY = 1e-9
 # and double make none worse.
 _DECADE_COSTS = 5.0
 # Pairs are formed of so many factors that fit best; half and double change 8 and 5, none is worse.
+# By 250 a recorded log, Intel, gets a slip that is none.
 _CANDIDATES = 200
 
 

@@ -47,8 +47,8 @@ BY_CHANCE = 1e-3
 # The variances of odometry and loops are no further apart: beyond, the weights of the one are lost
 # in the rounding of the other, and no map can be factored.
 LEAST_RATIO = 1e-5
-# A factor whose residual has a variance below this part of its noise is checked by no other.
-_REDUNDANT = 1e-6
+# A factor whose residual has a variance below this part of its noise is hardly checked by others.
+CHECKED = 0.01
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,12 @@ class Posterior:
         Return the squared innovation of each factor by all others, (m,).
 
         With the covariance R of the residual, `R^-1 r` is the residual of the factor if it were
-        left out and R^-1 its covariance, so the square is r'R^-1 r. Where no other factor says
+        left out and R^-1 its covariance, so the square is r'R^-1 r. Where the others hardly say
         anything of it, that is 0.
         """
         moment = filled(self.moment, ~self.speaks).copy()
         square: Array = kernels.prediction.normalise(moment, self.residual)[0]
-        alone = np.trace(self.moment, axis1=1, axis2=2) < _REDUNDANT
+        alone = np.trace(self.moment, axis1=1, axis2=2) < CHECKED
         return np.where(alone | ~np.isfinite(square), 0.0, square)
 
 

@@ -41,8 +41,9 @@ from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 _LONG = 10.0
 # Noise is judged in a part of the graph: a dense graph of 50,000 poses takes minutes to solve.
 _PART = 2000
-# Fewer spare measurements than this tell nothing of their noise.
-FEWEST_SPARE = 20
+# Fewer spare measurements than this tell nothing of their noise, nor fewer steps of how a robot
+# moves; and against as many counts what was known of a noise before.
+FEWEST = 20
 # Poses need not be exact for their residuals to have the right size, nor ratios: steps at most,
 # and the part of chi2, or of a ratio, that no longer matters.
 _STEPS = 20
@@ -143,7 +144,7 @@ def noise_scales(graph: FactorGraph, rng: 'np.random.Generator') -> NoiseScales:
     """
     part, keyframes, is_loop = densest_part(graph)
     ends = int(keyframes[0]), int(keyframes[-1])
-    if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < FEWEST_SPARE:
+    if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < FEWEST:
         return NoiseScales(np.nan, np.nan, *ends, np.nan)
     system = _system(part, _l2_poses(part))
     group = np.repeat(is_loop.astype(np.int64), graph.manifold.TANGENT_SIZE)
@@ -157,12 +158,12 @@ def noise_scales(graph: FactorGraph, rng: 'np.random.Generator') -> NoiseScales:
         left = left_of(np.stack((system.b, np.sqrt(variance)[group] * noise), axis=1))
         found, drawn = (np.bincount(group, column**2, minlength=2) for column in left.T)
         spare = drawn / variance
-        ratio = np.divide(found, drawn, out=np.ones(2), where=spare >= FEWEST_SPARE)
+        ratio = np.divide(found, drawn, out=np.ones(2), where=spare >= FEWEST)
         variance = np.clip(variance * ratio, 1e-12, 1e12)
         if (np.abs(ratio - 1) < _TOLERANCE).all():
             break
-    odometry, loops = np.where(spare >= FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
-    known = (spare >= FEWEST_SPARE).all()
+    odometry, loops = np.where(spare >= FEWEST, np.sqrt(variance), np.nan).tolist()
+    known = (spare >= FEWEST).all()
     offset = lacked_step(part, is_loop, system.b, variance, left_of) if known else None
     return NoiseScales(odometry, loops, *ends, _turns(part.manifold, left), offset)
 

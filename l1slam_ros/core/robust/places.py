@@ -119,23 +119,6 @@ def mates(place: Indices, ends: Array) -> tuple[Indices, Indices]:
     return np.concatenate((one, other)), np.concatenate((other, one))
 
 
-def join_what_no_other(place: Indices, parts: Indices, joins: Mask) -> Mask:
-    """
-    Return which places have a loop between two parts that no accepted loop elsewhere joins.
-
-    place : (m,) of each loop; parts : (2, m) that it joins, the lower first; joins : (m,) accepted
-    """
-    _, pair = np.unique(
-        pair_key(parts[0], parts[1], parts.max(initial=0) + 1), return_inverse=True)
-    alone = np.zeros(place.max(initial=-1) + 1, bool)
-    accepted = np.bincount(pair[joins], minlength=len(pair))
-    of_place = place * (len(pair) + 1) + pair
-    _, number = np.unique(of_place, return_inverse=True)
-    here = np.bincount(number, joins, len(pair))
-    alone[place[accepted[pair] == here[number]]] = True
-    return alone
-
-
 def beside_refused(pairs: tuple[Indices, Indices], refused: Mask, true: Mask) -> Array:
     """
     Return what the other loops of its place speak against each factor, ln of odds, (m,).

@@ -44,7 +44,6 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     spanned,
     strongest_group,
 )
-from l1slam_ros.core.robust.places import join_what_no_other
 from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 
@@ -101,8 +100,7 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     """
     Yield the loops of one place, accepted or not, that alone say how two parts lie to each other.
 
-    Parts are what is between two gaps, or slips that were cut. Of slips alone nobody asks: a lie
-    hardly has the robot move there as elsewhere.
+    Parts are what is between two gaps, or beside these slips that were cut.
     """
     given = growth.given
     sure = ~given.is_loop | given.trusted | given.factors.is_absolute
@@ -112,12 +110,14 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     i, j = part[given.low[rows]], part[given.high[rows]]
     _, place, count = np.unique(given.place[rows], return_inverse=True, return_counts=True)
     joins = growth.accepted[rows]
-    order = np.argsort(-count, kind='stable')
-    for number in order[join_what_no_other(place, np.sort((i, j), axis=0), joins)[order]]:
+    n = int(part.max()) + 1
+    _, pair = np.unique(pair_key(i, j, n), return_inverse=True)
+    for number in np.argsort(-count, kind='stable'):
         own = place == number
-        without, joined = (
-            len(np.unique(lowest_of_components(i[some], j[some], int(part.max()) + 1)))
-            for some in (joins & ~own, joins | own))
+        if np.bincount(pair[joins & ~own], minlength=len(pair))[pair[own]].all():
+            continue  # others join the same parts
+        without, joined = (len(np.unique(lowest_of_components(i[some], j[some], n)))
+                           for some in (joins & ~own, joins | own))
         if joined < without:
             # Rivals that say it otherwise are of the same doubt.
             joins |= own

@@ -8,21 +8,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A place is measured in metres along the way, and has one vote."""
 
-from collections import Counter
-
 import numpy as np
 import pytest
 from lies import careful_world
 from problems import chain_of, graph_of, measure, straight
 
-from l1slam_ros.core.graph.factor_graph import lowest_of_components
-from l1slam_ros.core.robust.places import (
-    beside_refused,
-    first_told,
-    join_what_no_other,
-    mates,
-    places,
-)
+from l1slam_ros.core.robust.places import beside_refused, first_told, mates, places
 
 
 def corridor(step, pairs, off):
@@ -81,21 +72,3 @@ def test_what_is_true_beside_refused_ones_has_to_be_the_surer_the_rarer_that_was
     # Of the nine that are refused six stand beside such, of the ninety true ones none.
     assert against[5] == pytest.approx(np.log(7 / 10 * 91))
     assert not beside_refused(mates(np.arange(100), ends), refused, ~refused).any()
-
-
-def test_places_that_are_passed_over_join_nothing_alone():
-    """Without such a place, and with all its loops accepted, as many parts are apart."""
-    rng, kept = np.random.default_rng(0), Counter()
-    for _ in range(200):
-        place, n = np.unique(rng.integers(0, 8, 20), return_inverse=True)[1], rng.integers(2, 6)
-        parts = np.sort(rng.integers(0, n, (2, 20)), axis=0)
-        joins = rng.random(20) < 0.6
-        may = join_what_no_other(place, parts, joins)
-        for number in np.unique(place):
-            own = place == number
-            without, joined = (
-                len(np.unique(lowest_of_components(*parts[:, some], n)))
-                for some in (joins & ~own, joins | own))
-            assert may[number] or joined == without
-            kept[bool(may[number])] += 1
-    assert kept[False] > 100 and kept[True] > 100

@@ -40,9 +40,6 @@ from l1slam_ros.core.robust.pairwise_consistency import (
 from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 
-# Each time that noise is learnt anew, half of what it was learnt of before stays.
-_LEARNT_ANEW = 3
-
 
 def join(growth: Growth, by_runs: bool = False) -> bool:
     """
@@ -112,7 +109,7 @@ def without(growth: Growth, step: int, motion: Motion) -> tuple[Growth | None, f
             return None, 0.0
     state.accept_more()
     if not (state.accepted & ~growth.accepted).any():
-        state.learn_noise_anew(_LEARNT_ANEW)  # it was learnt of the slip, too
+        state.learn_noise_anew()  # it was learnt of the slip, too
     return state, costs
 
 

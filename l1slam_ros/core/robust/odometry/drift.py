@@ -34,10 +34,6 @@ from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 
-# Odometry whose variance is so many times what it states may drift; by half or double none of 89
-# runs is another.
-NOISY = 4.0
-
 
 def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
     """Return a graph in the plane, each step of whose odometry turns by `drift` more a metre."""

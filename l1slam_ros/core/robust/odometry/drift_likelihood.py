@@ -41,15 +41,16 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.gating import TINY
+from l1slam_ros.core.robust.pairwise_consistency import ASKED
 from l1slam_ros.core.robust.places import places
 
 # [rad/m] What wheels and gyros drift by: its standard deviation, and the most that is looked for.
 USUAL, _MOST = 0.03, 0.18
-# [rad/m] Drifts are looked for so far apart; near so many of the likeliest, so many times as near,
-# until the longest loop tells them apart by no more than so much [rad].
+# [rad/m] Drifts are looked for so far apart; near so many of the likeliest, twice as near
+# each time, until the longest loop tells them apart by no more than so much [rad].
 _STEP = 0.0008
 _PEAKS = 40
-_FINER, _FINE = 5, 0.02
+_FINE = 0.02
 # Nearly as likely as the likeliest is none with this part of its odds to all loops being lies, and
 # worth a look another drift: loops of a lap share much of their errors, so that odds are less than
 # they seem. So many are looked at most.
@@ -60,10 +61,6 @@ _TRIED = 8
 _NOISE = np.logspace(-3, 3, 13)
 # Rounds of expectation and maximisation of the share of true loops.
 _ROUNDS = 12
-# So many loops are asked at most.
-_ASKED = 500
-# The density of a lie's turn.
-_EVEN = 1 / (2 * np.pi)
 
 
 def likely_drifts(graph: FactorGraph) -> Array:
@@ -76,7 +73,7 @@ def likely_drifts(graph: FactorGraph) -> Array:
     rows = np.flatnonzero(~graph.between.is_odometry & ~graph.between.is_absolute)
     if graph.manifold is not se2 or not len(rows):
         return np.zeros(0)
-    rows = rows[:: max(1, len(rows) // _ASKED)]
+    rows = rows[:: max(1, len(rows) // ASKED)]
     likelihood = _drift_likelihood(bridged(graph), rows)
     drifts = likelihood.peaks()
     values = np.array([likelihood.value(drift, USUAL**2) for drift in drifts])
@@ -158,8 +155,8 @@ class _DriftLikelihood:
         step = _STEP
         metres = float(self._headings[0].max())
         while step * metres > _FINE:
-            near = drift + step * np.linspace(-1, 1, 2 * _FINER + 1)
-            step /= _FINER
+            step /= 2
+            near = drift + step * np.linspace(-2, 2, 5)
             drift = float(near[np.argmax(self._by_headings(near, step, np.array([q]))[0])])
         return drift
 
@@ -185,7 +182,8 @@ class _DriftLikelihood:
             variance = self.own[:, 2, 2] + q * turns + (metres * step) ** 2 / 12
             even = np.where(variance > np.pi**2 / 3, 1.0, 0.0)
             ratio = np.exp(square * (-1 / variance).astype(np.float32))
-            ratio *= (1 / np.sqrt(2 * np.pi * variance) / _EVEN).astype(np.float32)
+            # A lie's turn has the density 1 / (2 pi).
+            ratio *= np.sqrt(2 * np.pi / variance).astype(np.float32)
             # All around the circle, what is wider than it is even.
             np.maximum(ratio, even.astype(np.float32), out=ratio)
             values.append(_log_likelihood(ratio, self.weight) + log_prior(

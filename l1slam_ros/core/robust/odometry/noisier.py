@@ -21,10 +21,7 @@ from l1slam_ros.core.robust.pairwise_consistency import RUN, runs
 from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 
 # By so much more the odometry may vary than its good steps say, for a run to be looked at.
-NOISIER = 30.0
-# Noise is learnt anew so often: once from noise that is far too large, and once from what was left
-# of that. Where only runs tell of it, more is left each time.
-_LEARNT_ANEW, _LEARNT_OF_RUNS = 2, 8
+FAR_NOISIER = 30.0
 
 
 def with_runs(growth: Growth) -> Growth | None:
@@ -43,7 +40,7 @@ def with_runs(growth: Growth) -> Growth | None:
             loops.any() and given.may_err_as_one(np.flatnonzero(loops))):
         return None
     noisier = growth.copy()
-    noisier.noise = replace(noise, variance=noise.variance * (NOISIER, 1.0))
+    noisier.noise = replace(noise, variance=noise.variance * (FAR_NOISIER, 1.0))
     noisier.solve()
     found = noisier.innovations(rows)
     groups = runs(growth, rows[found.square < given.gate(found.freedom)])
@@ -54,7 +51,7 @@ def with_runs(growth: Growth) -> Growth | None:
         state.accepted[group.rows] = state.ventured[group.rows] = True
     state.noise = replace(noise, variance=noisier.noise.variance)
     state.drops[:] = 0
-    state.learn_noise_anew(_LEARNT_ANEW if loops.any() else _LEARNT_OF_RUNS)
+    state.learn_noise_anew()
     state.accept_more()
     won = gain_of_places(growth, growth, state)
     return state if won > max(_noisier_costs(growth, state), 0.0) else None

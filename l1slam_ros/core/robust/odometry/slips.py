@@ -24,13 +24,14 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.robust.gating import DOUBT
+from l1slam_ros.core.robust.inspection import FEWEST
 from l1slam_ros.core.robust.odometry.cuts import put_back, settled, unusual, without
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
     log_odds_of_slips,
     usual_motion,
 )
-from l1slam_ros.core.robust.odometry.noisier import NOISIER, with_runs
+from l1slam_ros.core.robust.odometry.noisier import FAR_NOISIER, with_runs
 from l1slam_ros.core.robust.odometry.together import agreeing, without_some
 from l1slam_ros.core.robust.odometry.untold import LEAST, untold_slip
 from l1slam_ros.core.robust.pairwise_consistency import gain_of, spanned, strongest_group
@@ -43,8 +44,6 @@ Attempt = tuple[int, Growth | None, float]
 _TRIED = 2
 # What is nearly sure: ln of the odds.
 SURE = float(np.log(1 / DOUBT - 1))
-# Of fewer steps there is no habit.
-_FEWEST_STEPS = 20
 
 
 def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
@@ -57,7 +56,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     """
     growth.slip_odds = {
         step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
-    if np.count_nonzero(~growth.given.is_loop & ~growth.cut) < _FEWEST_STEPS:
+    if np.count_nonzero(~growth.given.is_loop & ~growth.cut) < FEWEST:
         return None
     motion = usual_motion(growth)
     odds = log_odds_of_slips(growth, motion)
@@ -95,7 +94,7 @@ def _best(growth: Growth, as_stated: Growth, motion: Motion, odds: Array,
 def _together(growth: Growth, motion: Motion) -> Iterator[Attempt]:
     """Yield states without steps that slipped together, see `together`."""
     agree = agreeing(growth)
-    for noisier in (1.0, NOISIER):
+    for noisier in (1.0, FAR_NOISIER):
         state = without_some(growth, agree, noisier)
         if not state:  # in the other map they would hardly agree more, and both take long
             return

@@ -19,9 +19,8 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.robust.gating import DOUBT
-from l1slam_ros.core.robust.odometry.drift import NOISY
 from l1slam_ros.core.robust.pairwise_consistency import agreement, asked
-from l1slam_ros.core.robust.rounds.growth import Growth
+from l1slam_ros.core.robust.rounds.growth import NOISIER, Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -78,4 +77,4 @@ def without_some(growth: Growth, agree: Indices, noisier: float) -> Growth | Non
     state.label_parts()
     state.solve()
     state.accept_more()
-    return state if state.noise.variance[0] < NOISY * growth.noise.variance[0] else None
+    return state if state.noise.variance[0] < NOISIER * growth.noise.variance[0] else None

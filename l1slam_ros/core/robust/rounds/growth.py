@@ -25,6 +25,7 @@ from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.gating import DOUBT, believable, noise_variance
 from l1slam_ros.core.robust.innovation import (
+    CHECKED,
     LEAST_RATIO,
     Innovations,
     Posterior,
@@ -33,7 +34,7 @@ from l1slam_ros.core.robust.innovation import (
     innovations,
     sample_posterior,
 )
-from l1slam_ros.core.robust.inspection import repeated_factors
+from l1slam_ros.core.robust.inspection import FEWEST, repeated_factors
 from l1slam_ros.core.robust.places import beside_refused
 from l1slam_ros.core.robust.rounds.evidence import evidence_of
 from l1slam_ros.core.robust.rounds.noise import Noise
@@ -48,13 +49,12 @@ _CHANCES = 2
 # The tail of the noise ends no further off than so many times what nearly all stay below, in
 # squares.
 _TAIL = 2.0
-# What is measured of the noise counts against as many factors on which it was measured before.
-_KNOWN = 20
 # Noise that is so many times the variance that was found is measured anew before any loop is
-# dropped for it, by the median of chi2 over its freedom; by factors that others check at all.
-_NOISIER = 3.0
-_MEDIAN = 0.79
-_CHECKED = 0.01
+# dropped for it, by the median of factors that others check; so many times what is stated, the
+# odometry may drift.
+NOISIER = 3.0
+# So often noise is learnt anew of other factors: each time half of what it was before may stay.
+_LEARNT_ANEW = 8
 # While driving so many of the last absolute factors are looked at, with their neighbours.
 _LATEST = 50
 # The variance of an odometry factor that was cut, in units of its own: loops alone decide, and far
@@ -240,9 +240,9 @@ class Growth:
             self.fits_found[tail] = True
             self.accept_more()
 
-    def learn_noise_anew(self, times: int) -> None:
+    def learn_noise_anew(self) -> None:
         """Solve, and learn the noise of what is accepted now alone, again and again."""
-        for _ in range(times):
+        for _ in range(_LEARNT_ANEW):
             self.noise = self.noise.forgotten()
             self.solve()
 
@@ -278,10 +278,12 @@ class Growth:
             return False
         square = (self.posterior.residual**2).sum(axis=1)
         stated = np.trace(self.posterior.moment, axis1=1, axis2=2)
-        known = (stated > _CHECKED) & ~self.given.factors.is_absolute[rows]
+        known = (stated > CHECKED) & ~self.given.factors.is_absolute[rows]
         scale = np.array([np.median(square[known & kind] / stated[known & kind])
-                          if (known & kind).any() else 0.0 for kind in (~loops, loops)]) / _MEDIAN
-        noisier = scale > _NOISIER
+                          if (known & kind).any() else 0.0 for kind in (~loops, loops)])
+        k = self.given.graph.manifold.TANGENT_SIZE
+        scale *= k / chi2_quantile(0.5, np.array([k]))
+        noisier = scale > NOISIER
         self.noise = self.noise.found(np.where(noisier, scale, 1.0) * self.noise.variance)
         return bool(noisier.any())
 
@@ -302,7 +304,7 @@ class Growth:
 
         Absolute factors are as noisy as they say: of theirs a few tell nothing.
         """
-        kind, known = self.given.is_loop[rows], _KNOWN * self.given.graph.manifold.TANGENT_SIZE
+        kind, known = self.given.is_loop[rows], FEWEST * self.given.graph.manifold.TANGENT_SIZE
         own = np.where(self.given.factors.is_absolute[rows], 0.0, 1.0)
         found = np.bincount(kind, own * (self.posterior.residual**2).sum(axis=1), 2)
         stated = np.bincount(kind, own * np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
