@@ -26,7 +26,10 @@ _CLOSE = 1e-12
 
 def gamma_probability(a: float, x: float) -> float:
     """Return P(a, x), the regularised lower incomplete gamma function; x > 0."""
-    return _sum(_gamma_first(a, x), lambda n: x / (a + n))
+    first = _gamma_first(a, x)
+    if not first:  # so far out, on either side, that both tails are below what a number can be
+        return float(x > a)
+    return _sum(first, lambda n: x / (a + n))
 
 
 def gamma_quantile(a: float, probability: float) -> float:

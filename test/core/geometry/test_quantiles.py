@@ -25,6 +25,16 @@ def test_of_the_gamma_distribution(a, probability):
 
 
 @pytest.mark.parametrize('probability', PROBABILITIES)
+@pytest.mark.parametrize('a', [745.0, 7301.2, 1e5])
+def test_of_so_many_that_the_density_far_out_is_nothing(a, probability):
+    # Its logarithm is a difference of numbers as large as a log a.
+    within = 1e-9 + 1e-13 / (1 - probability)
+    assert gamma_quantile(a, probability) == pytest.approx(gammaincinv(a, probability), rel=within)
+    assert gamma_probability(a, a / 3) == pytest.approx(0, abs=1e-9)
+    assert gamma_probability(a, 3 * a) == pytest.approx(1)
+
+
+@pytest.mark.parametrize('probability', PROBABILITIES)
 @pytest.mark.parametrize('a, b', [(0.5, 12.0), (1.5, 11.0), (3.0, 9.5), (6.0, 6.5)])
 def test_of_the_beta_distribution(a, b, probability):
     within = max(1e-12, 1e-15 / (1 - probability))
