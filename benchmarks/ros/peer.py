@@ -37,7 +37,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
 from l1slam_ros.io.messages.conversion import stamp_of
-from l1slam_ros.ros.demo import executable
+from l1slam_ros.ros.shell.installed import executable
 
 KINDS = {ODOMETRY_TOPIC: Odometry, LOOP_TOPIC: PoseWithCovarianceStamped}
 PATIENCE = 900.0  # [s] the solver may have to be compiled

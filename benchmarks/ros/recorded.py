@@ -40,7 +40,7 @@ from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 from l1slam_ros.io.messages.conversion import stamped_pose
-from l1slam_ros.ros.demo import executable
+from l1slam_ros.ros.shell.installed import executable
 
 RATE = 400.0
 _BAG_RATE = 10.0  # keyframes a second, where a graph has no stamps

@@ -42,8 +42,8 @@ from small import groups_most
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.io.scans.carmen import read_carmen
-from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.shell.header import header
+from l1slam_ros.ros.shell.installed import executable
 
 RATE = 40.0
 # Both nodes' parameters.

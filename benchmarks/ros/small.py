@@ -38,7 +38,7 @@ from peer import Peer, UpdateTimes, arguments, cpu_seconds, heard
 
 from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.graphs.graph_file import read_graph_file
-from l1slam_ros.ros.demo import executable
+from l1slam_ros.ros.shell.installed import executable
 
 RATE = 40.0
 DEFAULTS = Path(__file__).parents[2] / 'config' / 'backend.yaml'

@@ -28,8 +28,8 @@ from std_srvs.srv import Trigger
 
 from bags import write_world
 from l1slam_ros.io.bags.reader import BagSummary, TopicSummary, read_raw
-from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.replay import Player
+from l1slam_ros.ros.shell.installed import executable
 
 DEADLINE = 300.0  # [s] the solver can have to be compiled first
 

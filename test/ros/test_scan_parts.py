@@ -31,7 +31,6 @@ from l1slam_ros.core.scans.odometry import ScanKeyframes, Step
 from l1slam_ros.core.scans.points import Mount, Scan
 from l1slam_ros.core.scans.submaps import Keyframe
 from l1slam_ros.io.node_options import NodeOptions, read_params_file
-from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.scans.messages import path_in, scan_in, whole
 from l1slam_ros.ros.scans.mounting import StaticTransforms
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
@@ -39,6 +38,7 @@ from l1slam_ros.ros.scans.placing import Placing
 from l1slam_ros.ros.scans.scan_odometry import IncrementalOdometry
 from l1slam_ros.ros.scans.scan_queue import ScanQueue
 from l1slam_ros.ros.shell.header import header
+from l1slam_ros.ros.shell.installed import executable
 
 SHIPPED = Path(__file__).parents[2] / 'config' / 'scan_loops.yaml'
 S = 10**9

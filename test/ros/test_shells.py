@@ -21,9 +21,9 @@ from test_introspection import INPUTS, OUTPUTS, PARAMETERS, SERVICES
 rclpy = pytest.importorskip('rclpy')
 
 from l1slam_ros.core.errors import L1SlamError
-from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.shell import domain
 from l1slam_ros.ros.shell.arguments import split
+from l1slam_ros.ros.shell.installed import executable
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 300.0  # [s] the solver can have to be compiled first

@@ -12,6 +12,8 @@ First poses from the graph alone: compose the measurements along a spanning tree
 In: a factor graph. Out: (n, p) poses, keyframe 0 at the identity.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
@@ -61,16 +63,25 @@ def _breadth_first(graph: FactorGraph, root: int) -> Indices:
     parent, too.
     """
     factors = graph.between
-    n = graph.n_poses
     labels = component_labels(graph)
     tied = factors.j[factors.is_absolute]
-    i, j = factors.i[~factors.is_absolute], factors.j[~factors.is_absolute]
+    roots = root, *tied[labels[tied] == labels[root]].tolist()
+    between = ~factors.is_absolute
+    return parents(factors.i[between], factors.j[between], graph.n_poses, roots)
+
+
+def parents(i: Indices, j: Indices, n: int, roots: Sequence[int]) -> Indices:
+    """
+    Return the parent of each of n nodes in breadth-first trees, (n,); -1: no path leads to it.
+
+    i, j : (m,) ends of the edges; roots : one tree after the other, each its own parent
+    """
     near, far = np.concatenate((i, j)), np.concatenate((j, i))
     order = np.lexsort((far, np.arange(len(near)) >= len(i), near))
     start = np.searchsorted(near[order], np.arange(n + 1)).tolist()
     neighbours = far[order].tolist()
     parent = [-1] * n
-    for first in (root, *tied[labels[tied] == labels[root]].tolist()):
+    for first in roots:
         if parent[first] >= 0:
             continue
         # One by one: a graph is often nearly a chain, with as many levels as keyframes.

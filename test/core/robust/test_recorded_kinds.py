@@ -22,7 +22,7 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.robust.batch_map import SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
-from l1slam_ros.core.robust.judgement import ONE_JOINS, ONE_PLACE, OTHER_MAP, SLIP, Doubt
+from l1slam_ros.core.robust.judgement import ONE_JOINS, ONE_PLACE, OTHER_MAP, Doubt
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 
@@ -144,10 +144,8 @@ def test_one_place_that_carries_all_is_doubtful_where_odometry_hardly_bears_it_o
     assert ONE_PLACE not in [doubt.kind for doubt in few.doubts]
 
 
-@pytest.mark.parametrize('turn, count, doubts', [
-    (0.0, 20, []), (np.pi / 2, 20, []), (np.pi / 2, 4, [OTHER_MAP, SLIP])])
-def test_a_slip_of_which_one_place_alone_tells_is_cut_by_a_run_and_doubtful_without(
-        turn, count, doubts):
+@pytest.mark.parametrize('turn, count', [(0.0, 20), (np.pi / 2, 20), (np.pi / 2, 4)])
+def test_a_slip_of_which_one_place_alone_tells_is_cut(turn, count):
     """The second lap's loops are refused first; those of the first half do not span the step."""
     lap, steps = ring(0)
     lap = lap.subset(np.arange(steps + count))
@@ -162,11 +160,9 @@ def test_a_slip_of_which_one_place_alone_tells_is_cut_by_a_run_and_doubtful_with
         near, near + 6, se2.retract(se2.between(true[near], true[near + 6]), noise),
         np.repeat(factors.sqrt_information[:1], len(near), axis=0))
     found, _ = robust_solve(graph)
-    assert [doubt.kind for doubt in found.doubts] == doubts
-    assert [doubt.first for doubt in found.doubts[1:]] == [400] * bool(doubts)
-    cut = [400] * bool(turn and not doubts)
-    assert graph.between.i[found.slips].tolist() == cut
-    assert np.count_nonzero(~found.accepted) == count * bool(doubts) + len(cut)
+    assert not found.doubts
+    assert graph.between.i[found.slips].tolist() == [400] * bool(turn)
+    np.testing.assert_array_equal(np.flatnonzero(~found.accepted), found.slips)
 
 
 @pytest.mark.parametrize('believed', [False, True])

@@ -16,12 +16,10 @@ parts are joined where loops of two places or more do. The sides of a gap are jo
 """
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
-from l1slam_ros.core.graph.spanning_tree import pair_key
+from l1slam_ros.core.graph.spanning_tree import pair_key, parents
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
     log_odds_of_slips,
@@ -158,8 +156,7 @@ def _in_series(state: Growth, cut: int) -> tuple[Indices, Indices]:
     n = given.graph.n_poses + 1  # the world is the last
     holds = np.flatnonzero(state.accepted & ~state.cut)
     low, high = given.low[holds] % n, given.high[holds]
-    joined = sparse.coo_array((np.ones(len(low)), (low, high)), (n, n)).tocsr()
-    before = breadth_first_order(joined, start, directed=False)[1]
+    before = parents(low, high, n, [start])
     way = [end]
     while way[-1] != start and before[way[-1]] >= 0:
         way.append(int(before[way[-1]]))
