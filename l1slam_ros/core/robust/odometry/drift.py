@@ -139,9 +139,9 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
     The rival is 0 [rad/m] where there is none; the odds are those against all rivals together.
 
     The first one is that without a drift. Where it explains loops, too, another has to be likelier
-    by one loop of each place, and by what two places are worth with the others of these, which
-    agree, be it a mistake or not; and to leave the odometry no noisier, as it would be if lies
-    came in by chance.
+    by what two places are worth, by all loops of each, which agree, be it a mistake or not: where
+    those of the first one are of one place, by one of each, too. And it has to leave the odometry
+    no noisier, as it would be if lies came in by chance.
 
     The longer a place is, the larger is the map: on a smaller one there would be more such places
     than loops were found at.
@@ -156,7 +156,8 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
     fitting = values + fits - count * fits[first] / max(count[first], 1)
     if stated:
         noise = np.array([straight.told.noise.variance[0] for straight in some])
-        fitting[(values < values[0]) | (noise > noise[0])] = -np.inf
+        alone = len(np.unique(some[0].told.given.place[some[0].loops])) < TWO_PLACES
+        fitting[(alone & (values < values[0])) | (noise > noise[0])] = -np.inf
         fitting[0] += sure
         values, first = fitting, int(np.argmax(fitting))
     # Either way a rival is less likely by no more than two places are worth.
