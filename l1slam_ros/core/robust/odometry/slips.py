@@ -73,16 +73,17 @@ def _best(growth: Growth, as_stated: Growth, motion: Motion, odds: Array,
           attempts: Iterator[Attempt]) -> Growth | None:
     """Return the state that is the likeliest of some, None: the one before is, see `_tried`."""
     found, most = None, 0.0
-    tried: set[bytes] = set()
+    tried: dict[bytes, int] = {}
     for step, state, costs in attempts:
         steps = np.flatnonzero(state.cut & ~growth.cut) if state else np.array([step])
         if not state or (costs and not len(steps)):  # a loop that was chosen shows a slip, or none
             _suspect(growth, step, float(odds[step]))
             continue
-        # The same cuts with fewer loops would be less unusual.
-        if state.cut.tobytes() in tried:
+        # By fewer loops the same cuts would be less unusual.
+        cuts, accepted = state.cut.tobytes(), np.count_nonzero(state.accepted)
+        if tried.get(cuts, -1) > accepted:
             continue
-        tried.add(state.cut.tobytes())
+        tried[cuts] = int(accepted)
         usual = not np.isin(steps, unusual(state, motion)).any()
         evidence = _odds_of_cuts(growth, state, motion, odds, usual) - costs
         evidence += gain_of(growth, as_stated, state) if usual else 0.0
