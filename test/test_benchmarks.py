@@ -9,6 +9,7 @@
 """What can be told of the benchmarks without the peers: marks, medians, ratios, bounds, tables."""
 
 import importlib
+import inspect
 import json
 import sys
 from pathlib import Path
@@ -39,6 +40,8 @@ def test_what_an_ablation_leaves_out_is_a_function_of_the_judgement(rule):
     function, holders, name = ablation.places_of(rule)
     assert all(vars(holder)[name] is function for holder in holders)
     assert 2 < ablation.lines_of(function) < 40
+    # What stands for it takes what it takes.
+    inspect.signature(ablation.RULES[rule]).bind(*inspect.signature(function).parameters)
     assert f'{name}`' in (FOLDER / 'robust' / 'SENSITIVITY.md').read_text()
 
 

@@ -52,7 +52,7 @@ RULES: dict[str, Callable[..., Any]] = {
     'pairwise_consistency.longest_run': lambda growth, rows: NO_GROUP,
     'pairwise_consistency.gain_of': gain_of_places,
     'odometry.drift_likelihood.likely_drifts': lambda graph: np.zeros(0),
-    'odometry.drift.Straight.fits': lambda straight, loops, as_found: (0.0, 0),
+    'odometry.drift.Straight.fits': lambda straight, loops: (0.0, 0),
     'odometry.noisier.with_runs': lambda growth: None,
     'odometry.noisier._noisier_costs': lambda growth, noisier: 0.0,
     'odometry.slips.without_slip': lambda growth, as_stated: None,
@@ -65,7 +65,7 @@ RULES: dict[str, Callable[..., Any]] = {
     'reasons._decides_alone': lambda growth, accepted: False,
     'reasons._joining_alone': lambda growth: iter(()),
     'reasons._joining_otherwise': lambda growth: iter(()),
-    'reasons._may_be_right': lambda growth, group: False,
+    'reasons._may_be_right': lambda growth, group, accepted: False,
     'reasons._may_have_slipped': lambda growth, group: [],
     'batch._norm_doubts': lambda *_: (),
 }

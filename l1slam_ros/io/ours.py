@@ -77,7 +77,7 @@ def is_ours(path: str | os.PathLike[str]) -> bool:
                    for begin, mark in _PICTURES.items()))
 
 
-def _holds(folder: str | os.PathLike[str], path: str) -> bool:
+def _holds(folder: str | os.PathLike[str], path: str | os.PathLike[str]) -> bool:
     """Tell whether `path` is the folder or lies in it."""
     inside = Path(os.path.realpath(path))
     return Path(os.path.realpath(folder)) in (inside, *inside.parents)
@@ -131,8 +131,7 @@ def _is_part(output: str | os.PathLike[str], path: str | os.PathLike[str]) -> bo
     """Tell whether an input is the output, lies in it, or is a directory that contains it."""
     if not os.path.exists(output):
         return False
-    if os.path.isdir(output) and Path(os.path.realpath(output)) in Path(
-            os.path.realpath(path)).parents:
+    if os.path.isdir(output) and _holds(output, path):
         return True
     parts = [path, *(os.scandir(path) if os.path.isdir(path) else ())]
     return any(os.path.exists(part) and os.path.samefile(output, part) for part in parts)

@@ -82,7 +82,8 @@ def test_a_noise_that_is_stated_far_too_small_or_large_is_no_drift(n, loops, see
 
 @pytest.mark.parametrize('drift, seed, doubtful', [
     *((-0.01, seed, seed in (4, 6)) for seed in range(8)),
-    # More than a turn and a half on the lap the other way round: wrong for the five other seeds.
+    # More than a turn and a half on the lap the other way round: 2 to 6 are wrong, of these 4, 5
+    # and 6 without a doubt, as `doc/doubts.md` says.
     (-0.06, 0, False), (-0.06, 1, False), (-0.06, 3, True), (-0.06, 7, False)])
 def test_of_turns_more_that_loops_fit_the_one_is_taken_that_leaves_the_largest_map(
         drift, seed, doubtful):

@@ -179,6 +179,14 @@ def _in_series(state: Growth, cut: int) -> tuple[Indices, Indices]:
     return (np.append(cut, holds[along[alone]]), np.append(0, np.where(one < other, 1, -1)[alone]))
 
 
+def _measured_end(state: Growth, cut: int) -> Array:
+    """Return where the keyframe after a cut is by the step that is cut, (1, p)."""
+    given, row = state.given, np.array([cut])
+    end: Array = given.graph.manifold.compose(
+        state.poses[given.low[row]], given.factors.measurement[row])
+    return end
+
+
 def _cut_at(state: Growth, cut: int, step: int) -> Growth:
     """Return the state that is cut at a step and not where it is."""
     state, given = state.copy(), state.given
@@ -187,9 +195,9 @@ def _cut_at(state: Growth, cut: int, step: int) -> Growth:
     holds[cut] = False
     part = component_labels(given.graph.subset(holds))
     beyond = part == part[given.high[cut]]
-    manifold, row = given.graph.manifold, np.array([cut])
-    wanted = manifold.compose(state.poses[given.low[row]], given.factors.measurement[row])
-    motion = manifold.compose(wanted, manifold.inverse(state.poses[given.high[row]]))
+    manifold = given.graph.manifold
+    motion = manifold.compose(
+        _measured_end(state, cut), manifold.inverse(state.poses[[given.high[cut]]]))
     state.poses = state.poses.copy()
     state.poses[beyond] = manifold.compose(
         np.repeat(motion, np.count_nonzero(beyond), axis=0), state.poses[beyond])
@@ -244,8 +252,7 @@ def _repaired(state: Growth, cut: int, steps: Indices, side: Indices) -> tuple[A
     root, spread = unwhitening(measured, row), measured.innovations(row).spread
     count, side = len(steps), side[:, None]
     high = np.repeat(poses[given.high[row]], count, axis=0)
-    back = np.repeat(manifold.compose(poses[given.low[row]], given.factors.measurement[row]),
-                     count, axis=0)
+    back = np.repeat(_measured_end(state, cut), count, axis=0)
     after = manifold.between(np.where(side < 0, back, high), poses[given.high[steps]])
     moved = manifold.compose(manifold.between(
         poses[given.low[steps]], np.where(side > 0, back, high)), after)

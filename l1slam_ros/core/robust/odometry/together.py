@@ -16,7 +16,8 @@ with each other, which false ones hardly do; and L1 leaves what does not fit on 
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.pairwise_consistency import agreement, asked
@@ -57,15 +58,16 @@ def without_some(growth: Growth, agree: Indices, noisier: float) -> Growth | Non
     graph = growth.uncut().subgraph(rows).subset(
         np.arange(len(rows)), np.where(loops, 1.0, noisier))
     cholesky = cholesky_of(graph)
+    gate = given.gate(given.factors.freedom[rows])
     poses = seed_poses(graph, cholesky)
     # Nearly as many fit the seed already, which takes a moment.
-    for minimise in (False, True):
-        if minimise:
-            poses = minimise_interior_point(graph, poses, OptimiserOptions(), cholesky).poses
-        square = (whitened_residual(graph, poses).reshape(len(rows), -1)**2).sum(axis=1)
-        fits = square < given.gate(given.factors.freedom[rows])
-        if 2 * np.count_nonzero(np.isin(agree, rows[fits])) < len(agree):
-            return None
+    if not _explains(rows[_squares(graph, poses) < gate], agree):
+        return None
+    poses = minimise_interior_point(graph, poses, OptimiserOptions(), cholesky).poses
+    square = _squares(graph, poses)
+    fits = square < gate
+    if not _explains(rows[fits], agree):
+        return None
     state = growth.copy()
     state.accepted = ~given.is_loop | given.trusted
     state.accepted[rows[fits]] = True
@@ -81,3 +83,15 @@ def without_some(growth: Growth, agree: Indices, noisier: float) -> Growth | Non
     state.solve()
     state.accept_more()
     return state if state.noise.variance[0] < NOISIER * growth.noise.variance[0] else None
+
+
+def _squares(graph: FactorGraph, poses: Array) -> Array:
+    """Return the squared length of the whitened residual of each factor, (m,)."""
+    rows = whitened_residual(graph, poses).reshape(len(graph.between), -1)
+    square: Array = (rows**2).sum(axis=1)
+    return square
+
+
+def _explains(fitting: Indices, agree: Indices) -> bool:
+    """Return whether half or more of the loops that agree are among those that fit."""
+    return bool(2 * np.count_nonzero(np.isin(agree, fitting)) >= len(agree))
