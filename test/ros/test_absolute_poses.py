@@ -13,8 +13,8 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from fixes import seen
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from gps import seen
 from node_bench import EVERY_MESSAGE, call, odometry, poses_of
 
 from l1slam_ros.core.geometry import se2

@@ -10,7 +10,7 @@
 
 import numpy as np
 import pytest
-from gps import FRAME, seen
+from fixes import FRAME, seen
 from numpy.testing import assert_allclose
 from problems import (
     PERIOD,
