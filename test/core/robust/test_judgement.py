@@ -132,7 +132,7 @@ def test_a_lie_that_was_believed_is_dropped_when_the_truth_comes(bad):
     believed = Judgement.nothing().extended(bad.graph, True)
     lie = int(np.flatnonzero(is_false(bad, bad.graph.between))[30])
     believed.accepted[lie], believed.suspect[lie] = True, False
-    judgement, poses = judge(bad.graph, bad.odometry, believed, np.inf)
+    judgement, poses = judge(bad.graph, bad.odometry, believed)
     assert not judgement.accepted[is_false(bad, bad.graph.between)].any()
     assert not judgement.suspect[lie] and judgement.sigmas[lie] > 4
     assert position_error(poses, bad.truth) < 0.2
