@@ -186,6 +186,12 @@ class MapState(NamedTuple):
         """Return the state while the judge works on all present loops."""
         return self._replace(judged=replace(self.judged, wanted=False, began=now))
 
+    def given_up(self, now: float) -> 'MapState':
+        """Return the state after a judgement from the graph alone that did not end."""
+        judged = self.judged
+        return self._replace(
+            judged=replace(judged, anew_ended=now, anew_took=now - judged.began))
+
     def judged_by(self, judgement: Judgement, poses: Array, loops: int, anew: bool, held: bool,
                   factors: BetweenFactors, now: float) -> 'MapState':
         """

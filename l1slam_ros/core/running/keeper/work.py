@@ -19,6 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from l1slam_ros.core.bordered.front import Front, Look
+from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
@@ -36,6 +37,8 @@ from l1slam_ros.core.running.snapshot import Snapshot
 # longer by the clock.
 _LEAST_ROUND = 0.1
 _PATIENCE = 4
+# [s] While a robot drives, all loops are judged from the graph alone for no longer if others came.
+_LONGEST = 10.0
 # With less confidence a map is more likely wrong than right.
 _EVEN = 0.5
 # Factors that a new front takes before it looks whether to stop.
@@ -100,17 +103,34 @@ def _caught_up(keeper: Keeper, front: Front, part: Mask, again: bool, check: Che
 
 
 def judge_all(keeper: Keeper, anew: bool, moment: Moment, check: Check) -> None:
-    """Judge all loops; anew : from the graph alone, when idle until the graph grows."""
+    """
+    Judge all loops; anew : from the graph alone.
+
+    That ends early when idle, where the graph grows, and while driving, where new loops wait for
+    too long: after seconds of searching for a slip or a drift, it would be of old evidence.
+    """
     now, grown = keeper.begin_judgement()
+    late = time.monotonic() + _LONGEST
+
+    def is_out_of_date() -> bool:
+        if moment.idle:
+            return keeper.revisions.grown != grown
+        return time.monotonic() > late and keeper.look()[2].loops > len(now.loop_rows)
+
     whole = now.problem()
     turned, order = by_robot(whole)
     problem = as_one(turned)
-    alone = until(lambda: keeper.revisions.grown != grown, check) if moment.idle else check
     graph = problem.graph
     known = problem.judgement
     poses = problem.poses
-    judgement, l2_poses = (robust_solve(graph, check=alone, known=(known, poses)) if anew
-                           else judge(graph, poses, known, check))
+    try:
+        judgement, l2_poses = (
+            robust_solve(graph, check=until(is_out_of_date, check), known=(known, poses)) if anew
+            else judge(graph, poses, known, check))
+    except Interrupted:
+        if anew and not moment.idle:
+            keeper.change(now.map, lambda state, _: state.given_up(time.monotonic()))
+        raise
     check()
     take_judgement(keeper, now, *as_numbered(
         order, judgement.of_all(turned.graph), l2_poses), anew, moment.stands)
