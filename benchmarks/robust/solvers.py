@@ -32,8 +32,8 @@ _EVERY, _BUDGET = 10, 0.1
 _LAST_UPDATES, _LAST_BUDGET = 200, 0.5
 # [m, rad] Two measurements of one pair are the same loop.
 _SAME = 1e-6
-# Live: [s] at rest when no map came for so long, and in any case after so long.
-_REST, _LONGEST_REST = 3.0, 60.0
+# Live: [s] how often to look whether it is at rest, and for how long.
+_LOOK, _LONGEST_REST = 0.1, 120.0
 DOUBTFUL, REFUSED = 'doubtful', 'refused'
 
 
@@ -142,11 +142,10 @@ def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
 
 
 def _come_to_rest(backend: Backend) -> None:
-    """Wait, as a robot that stands still, until no map follows another."""
-    began, maps = time.monotonic(), -1
-    while backend.revisions.map != maps and time.monotonic() - began < _LONGEST_REST:
-        maps = backend.revisions.map
-        time.sleep(_REST)
+    """Wait, as a robot that stands still, until all is judged and mapped."""
+    began = time.monotonic()
+    while not backend.behind().at_rest and time.monotonic() - began < _LONGEST_REST:
+        time.sleep(_LOOK)
 
 
 def _found(backend: Backend, graph: FactorGraph, seconds: float,

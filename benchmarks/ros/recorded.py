@@ -45,7 +45,6 @@ from l1slam_ros.ros.shell.installed import executable
 RATE = 400.0
 _BAG_RATE = 10.0  # keyframes a second, where a graph has no stamps
 _AFTER = 5.0  # [s]
-_AT_REST = 20.0  # [s]
 _IDLE = 20.0  # [s]
 # As the note says that the conversion leaves in the bag.
 _AS_RECORDED = {'keyframe.translation': 0.0, 'keyframe.rotation': 0.0,
@@ -80,7 +79,8 @@ def _play(peer: Peer, graph: FactorGraph, bag: Path, rate: float) -> None:
     print(f'played in {time.monotonic() - began:.1f} s')
     peer.listen(_AFTER)
     _tell_map(peer.newest(), graph, f'{_AFTER:.0f} s later')
-    peer.listen(_AT_REST)
+    peer.until(lambda: peer.said['behind.at_rest'] == '1')
+    peer.listen(1.0)  # its Path
     _tell_map(peer.newest(), graph, 'at rest')
     before = cpu_seconds(peer.process.pid)
     peer.listen(_IDLE)

@@ -13,12 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import NamedTuple
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.running.improve import Improvement
-from l1slam_ros.core.running.snapshot import Behind, Robot
+from l1slam_ros.core.running.snapshot import Behind, Counts, Robot
+from l1slam_ros.io.sentences import doubt_sentence
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.intake import Traffic
 from l1slam_ros.ros.threads.solver_thread import SolverThread
@@ -125,26 +127,27 @@ class Diagnostics:
             self._jump |= {f'{prefix}jump.translation': f'{metres:.4f}',
                            f'{prefix}jump.rotation': f'{radians:.5f}'}
 
-    def publish(self, counts: Mapping[str, int], behind: Behind, refused: Counter[str],
-                told: Counter[str], twins: str, robots: Sequence[RobotLine] = ()) -> None:
+    def publish(self, counts: Counts, behind: Behind, refused: Counter[str], twins: str,
+                robots: Sequence[RobotLine] = ()) -> None:
         """
         Publish one status, and one of each robot.
 
-        counts : sizes of the graph; behind : the background work; refused : cause -> number
-        of messages, since the start; told : cause -> number of jumps of the odometry;
-        twins : a sentence if the node's name is not unique, else empty;
-        robots : those that have names.
+        counts : of the back end; behind : its background work; refused : cause -> number of
+        messages, since the start; twins : a sentence if the node's name is not unique, else
+        empty; robots : those that have names.
         """
+        told, judgement = Counter(counts.told), counts.verdict
         lately, broken = refused - self._minute[0][0], told - self._minute[0][1]
-        self._minute.append((Counter(refused), Counter(told)))
-        values = traffic_values(self._topics) | dict(counts)
+        self._minute.append((refused, told))
+        values = traffic_values(self._topics) | dict(counts.sizes)
         values['updates'] = self._updates
         if self._last is not None:
             values |= {'l1_cost': f'{self._last.cost:.6g}', 'gap': f'{self._last.gap:.3g}',
                        'update_seconds': f'{self._last.seconds:.4f}',
-                       'update_status': self._last.status.value,
-                       'odometry.drift': f'{self._last.judgement.drift:.4g}',
-                       'judgement.confidence': f'{self._last.judgement.confidence:.3g}'}
+                       'update_status': self._last.status.value}
+        values |= {'odometry.drift': f'{judgement.drift:.4g}',
+                   'judgement.confidence': f'{judgement.confidence:.3g}',
+                   'judgement.doubts': '; '.join(doubt.kind for doubt in judgement.doubts)}
         values |= {f'behind.{name}': f'{value:.6g}' for name, value in asdict(behind).items()}
         values |= self._jump
         for cause, count in sorted((+refused).items()):
@@ -157,12 +160,14 @@ class Diagnostics:
         lines = [one.status(name, self._topics) for one in robots]
         self._publisher.publish(array_of(self._node, [status, *lines]))
 
-    def _judgement(self, counts: Mapping[str, int], lately: Counter[str], broken: Counter[str],
+    def _judgement(self, counts: Counts, lately: Counter[str], broken: Counter[str],
                    twins: str) -> tuple[bytes, str]:
         """Return the level, and a sentence with all that is wrong now."""
         if failing := self._failures.sentence:
             return DiagnosticStatus.ERROR, failing
-        wrong = [twins] if twins else []
+        stamps = counts.stamps
+        doubts = doubt_sentence(counts.verdict.doubts, np.arange(len(stamps)), stamps)
+        wrong = [one for one in (twins, doubts) if one]
         wrong += filter(None, (traffic.unheard() for traffic in self._topics.values()))
         for name, traffic in self._topics.items():
             if name.endswith('odom') and (sources := traffic.publishers()) > 1:
@@ -173,8 +178,9 @@ class Diagnostics:
         if broken:
             causes = ', '.join(f'{count} {cause}' for cause, count in sorted(broken.items()))
             wrong.append(f'jumps of the odometry in the last minute: {causes}')
-        rejected = counts['rejected_loops']
-        judged = rejected + counts['accepted_loops'] + counts['suspect_loops']
+        sizes = counts.sizes
+        rejected = sizes['rejected_loops']
+        judged = rejected + sizes['accepted_loops'] + sizes['suspect_loops']
         if judged >= _FEW and rejected > judged / 2:
             wrong.append(f'{rejected} of {judged} loops are rejected')
         if self._solver.compiling:

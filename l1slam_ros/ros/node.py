@@ -197,8 +197,7 @@ class BackendNode(LifecycleNode):
             self.get_logger().warning(sentence)
         counts = self._backend.counts()
         self._diagnostics.publish(
-            counts.sizes, self._backend.behind(),
-            self._inputs.refused.copy() + Counter(counts.refused), Counter(counts.told),
+            counts, self._backend.behind(), self._inputs.refused + Counter(counts.refused),
             self._twins(), self._lines())
 
     def _lines(self) -> list[RobotLine]:

@@ -169,6 +169,11 @@ def test_optimize_takes_a_doubtful_map_and_says_so(bench, tmp_path):
     assert np.abs(taken.poses - poses).max() > 1
     assert (taken.loop_states().state == ACCEPTED).sum() > 90
     b.until(lambda: np.allclose(poses_of(b.path()), taken.poses, atol=1e-9), 'it is published')
+    b.until(lambda: answer.message in b.status()[1], 'diagnostics say the same')
+    level, _, values = b.status()
+    assert level == DiagnosticStatus.WARN
+    assert values['judgement.doubts'] == '; '.join(doubt.kind for doubt in expected.doubts)
+    assert values['judgement.confidence'] == f'{expected.confidence:.3g}'
 
 
 def test_no_update_while_paused(bench):

@@ -80,7 +80,7 @@ def test_a_settled_map_is_loaded_at_start_and_published_at_once(bench, tmp_path,
     first = bench(save_path=str(path))
     first.drive(0, 4)
     first.until(lambda: len(first.path().poses) == 4, 'a map')
-    first.until(lambda: first.backend._backend.snapshot().problem().settled, 'it settles')
+    first.until(lambda: first.backend._backend.behind().at_rest, 'it settles')
     assert call(first, 'save').success
     improved = []
     monkeypatch.setattr(work, 'improve', lambda *_: improved.append(1))

@@ -77,7 +77,7 @@ def test_a_map_over_a_restart_is_whole_and_the_restart_is_told_of(bench, capfd):
     # All that joins both parts is one lap driven twice: the map is taken, and that is said.
     answer = call(b, 'optimize')
     assert not answer.success and answer.message.startswith('doubtful: two parts of the map are ')
-    counts, refused, _ = b.backend._backend.counts()
+    counts, refused, *_ = b.backend._backend.counts()
     assert counts['accepted_loops'] == len(laps.loops) and not refused
     # The answer may come before the Path that goes with it.
     b.until(lambda: len(b.path().poses) == counts['keyframes'] and error_of(b.path()) < 0.2,

@@ -51,7 +51,6 @@ No loop is factored before it is accepted, so none bends what it is judged by. R
 `gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `cuts`, `together`, `slips`.
 """
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -321,7 +320,7 @@ def rounds(
 
 
 def judge(
-    graph: FactorGraph, poses: Array, known: Judgement, deadline: float,
+    graph: FactorGraph, poses: Array, known: Judgement,
     check: Callable[[], None] = lambda: None,
 ) -> Believed:
     """
@@ -333,21 +332,13 @@ def judge(
     Parameters
     ----------
     poses : (n, p) the map of what was accepted
-    deadline : `time.monotonic()` [s] after which no second round begins
     check : called before long steps, raises where the work shall stop
 
     """
     first = Growth(straightened(graph, known.drift), check)
-    settled = True
-    growth = first
     try:
         first.resume(poses, known.accepted, known.variance)
-        for growth in rounds(first):
-            # The end is not put off once it is in sight, or short budgets would never get there.
-            if time.monotonic() > deadline and not growth.noise.at_their_word:
-                settled = False
-                break
-        reasons = doubts(growth) if settled else ()
-        return judgement_of(growth, reasons, settled, known.drift), growth.poses
+        *_, growth = rounds(first)
+        return judgement_of(growth, doubts(growth), drift=known.drift), growth.poses
     except _FAILURES as error:
         return known.broken_off(graph, error), poses

@@ -60,6 +60,11 @@ def right_within(positions: Array) -> float:
     return max(_OFF, _OFF_PART * float(np.linalg.norm(np.ptp(positions, axis=0))))
 
 
+def expected_error(terms: Array, positions: Array) -> float:
+    """Return the error [m] that a map of such terms and positions (n, k) expects of itself."""
+    return float(np.exp(terms[2])) * right_within(positions)
+
+
 def unsureness(growth: Growth) -> float:
     """
     Return how large the error is that a map expects of itself, of its largest part.

@@ -230,8 +230,8 @@ def so_far(growth: Growth, drift: float = 0.0) -> Judgement:
                      drift=drift)
 
 
-def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), settled: bool = True,
-                 drift: float = 0.0, odds: float = np.inf) -> Judgement:
+def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float = 0.0,
+                 odds: float = np.inf) -> Judgement:
     """
     Return what a state says of the factors that were given.
 
@@ -256,7 +256,7 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), settled: bool 
     left_out = np.flatnonzero(loops & ~believed.accepted)
     # Where all loops came in, what the file states may be vague; there is nothing to settle. Of
     # fewer loops than a run has nothing is recorded.
-    if (settled and len(left_out) and np.count_nonzero(loops) >= RUN
+    if (len(left_out) and np.count_nonzero(loops) >= RUN
             and forecast(terms[:3]) < CONFIDENT):
         metres = unsure * right_within(growth.given.graph.manifold.positions(growth.poses))
         reasons += (doubt_of(given.factors.pairs[left_out], growth.given.graph.n_poses, WEAK,
@@ -264,8 +264,8 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), settled: bool 
     doubted = OTHER_MAP in kinds or bool(
         2 * len(left_out) > np.count_nonzero(loops) >= RUN)
     return replace(believed, suspect=suspect[:size], sigmas=np.sqrt(square[:size]),
-                   noise=_noise(growth)[:size], doubts=reasons, settled=settled,
-                   confidence=confidence, terms=terms, is_refusal_doubted=doubted)
+                   noise=_noise(growth)[:size], doubts=reasons, confidence=confidence, terms=terms,
+                   is_refusal_doubted=doubted)
 
 
 def _noise(growth: Growth) -> Array:

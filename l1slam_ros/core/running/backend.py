@@ -277,19 +277,21 @@ class Backend:
         return self._keeper.moved(robot)
 
     def counts(self) -> Counts:
-        """Return the size of the graph, and the counts of refused and unusual messages."""
+        """Return the size of the graph, counts of messages, and the verdict on the map."""
         with self._keeper.reading() as builder:
             revision = self.revisions.now
             notes = builder.notes
             refused, told = dict(notes.refused), dict(notes.told)
+            verdict = self._keeper.state.of_all, builder.keyframe_stamps
         if self._counted[0] != revision:
             self._counted = revision, self.snapshot().sizes()
-        return Counts(self._counted[1], refused, told)
+        return Counts(self._counted[1], refused, told, *verdict)
 
     def behind(self) -> Behind:
         """Return the state of the background work."""
         state, _, size = self._keeper.look()
-        return Behind.of(state, size.loops, time.monotonic(), self._updates.failing)
+        return Behind.of(state, size.loops, time.monotonic(), self._updates.failing,
+                         self._updates.at_rest)
 
     def news(self) -> list[str]:
         """Return new sentences on messages since the last call, see `GraphBuilder.notes`."""

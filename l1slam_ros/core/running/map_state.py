@@ -66,6 +66,7 @@ class Judged:
     loops : how many were judged; anew : how many were judged from the graph alone;
     doubted : how many there were when a judgement last doubted its own refusals; poses : (n, p)
     the L2 map of the last one, None: there is none; wanted : the front has left a loop that fits;
+    held : the last one was not taken, see `MapState.judged_by`;
     compared : the map that was last compared with that of another norm; began, ended, took : of
     the last one that went on from the one before; anew_ended, anew_took : of the last one anew
     """
@@ -75,6 +76,7 @@ class Judged:
     doubted: int
     poses: Array | None = None
     wanted: bool = False
+    held: bool = False
     compared: Optimised | None = None
     began: float = 0.0
     ended: float = 0.0
@@ -82,11 +84,12 @@ class Judged:
     anew_ended: float = 0.0
     anew_took: float = 0.0
 
-    def after(self, judgement: Judgement, poses: Array, loops: int, anew: bool,
+    def after(self, judgement: Judgement, poses: Array | None, loops: int, anew: bool,
               now: float) -> 'Judged':
         """Return the record after a judgement of `loops` loops; anew : from the graph alone."""
         doubted = loops if judgement.is_refusal_doubted else self.doubted
-        after = replace(self, loops=loops, poses=poses, compared=None, doubted=doubted, ended=now)
+        after = replace(self, loops=loops, poses=poses, held=False, compared=None,
+                        doubted=doubted, ended=now)
         if anew:
             return replace(after, anew=loops, anew_ended=now, anew_took=now - self.began)
         return replace(after, took=now - self.began)
@@ -159,7 +162,8 @@ class MapState(NamedTuple):
         A loop that was accepted early stays accepted as long as it fits. At rest there is time to
         judge whether it would be accepted now.
         """
-        return self.all_judged(loops) and (not self.robust or self.judged.anew == loops)
+        return self.all_judged(loops) and (
+            not self.robust or (self.judged.anew == loops and not self.judged.held))
 
     def told(self, factors: BetweenFactors) -> 'MapState':
         """Return the state with a person's decisions on some factors applied."""
@@ -182,18 +186,28 @@ class MapState(NamedTuple):
         """Return the state while the judge works on all present loops."""
         return self._replace(judged=replace(self.judged, wanted=False, began=now))
 
-    def judged_by(self, judgement: Judgement, poses: Array, loops: int, anew: bool,
+    def given_up(self, now: float) -> 'MapState':
+        """Return the state after a judgement from the graph alone that did not end."""
+        judged = self.judged
+        return self._replace(
+            judged=replace(judged, anew_ended=now, anew_took=now - judged.began))
+
+    def judged_by(self, judgement: Judgement, poses: Array, loops: int, anew: bool, held: bool,
                   factors: BetweenFactors, now: float) -> 'MapState':
         """
         Return the state after a judgement of so many loops, of which poses (n, p) is the L2 map.
 
         A judgement that accepts other factors than the map uses, or corrects them otherwise, is
-        pending until a map is made of it; anew : it is from the graph alone
+        pending until a map is made of it; anew : it is from the graph alone; held : such a one is
+        not taken, but made once more when the robot stands
         """
-        after = self._replace(judged=self.judged.after(judgement, poses, loops, anew, now))
         accepted = self.table.accepted[:len(judgement.accepted)]
         same = judgement.drift == self.of_all.drift and np.array_equal(
             judgement.accepted, accepted)
+        if held and not same:
+            judged = self.judged.after(judgement, self.judged.poses, loops, anew, now)
+            return self._replace(judged=replace(judged, held=True))
+        after = self._replace(judged=self.judged.after(judgement, poses, loops, anew, now))
         if self.pending is not None or not same:
             return after._replace(pending=judgement)
         return after._committed(judgement, factors)
@@ -244,18 +258,13 @@ class MapState(NamedTuple):
         return self._replace(
             of_all=of_all, judged=replace(self.judged, compared=self.optimised))
 
-    def account(self, loops: int, seconds: float) -> Improvement:
+    def account(self, seconds: float) -> Improvement:
         """Return the last `Improvement`, as the result of an update that took `seconds`."""
-        settled = self.all_judged(loops)
-        last = self.last
-        if last is None:
-            judgement = replace(self.table.judgement(self.of_all), settled=settled)
-            return Improvement(self.began, self.optimised.poses, self.optimised.dual, judgement,
-                               0.0, 0.0, Status.OUT_OF_TIME, 0, 0, 0, np.inf, seconds)
-        judgement = last.judgement
-        if judgement.settled != settled:
-            judgement = replace(judgement, settled=settled)
-        return replace(last, judgement=judgement, seconds=seconds)
+        if self.last is not None:
+            return replace(self.last, seconds=seconds)
+        return Improvement(self.began, self.optimised.poses, self.optimised.dual,
+                           self.table.judgement(self.of_all), 0.0, 0.0, Status.OUT_OF_TIME, 0, 0,
+                           0, np.inf, seconds)
 
 
 # The next state, by the present one and the factors that there are.

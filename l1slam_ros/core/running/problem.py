@@ -44,10 +44,9 @@ class Problem:
     map : names the map that it is of, another after `Backend.reset` and `Backend.restore`; graph :
     all factors; starts : poses (n, p) to start from, `poses` the first; dual : (rows,) to start
     from; judgement : of all factors; robust : loops may be doubted; last_cost : the cost that the
-    last update left, for as many factors as there are now; settled : nothing has come since an
-    update that converged; solved : (n, p) the last map that was solved for, the other keyframes as
-    they follow it; ties : so many of the last factors tie parts together, see `as_one`; pattern :
-    of the last factorisation, None: there was none.
+    last update left, for as many factors as there are now; solved : (n, p) the last map that was
+    solved for, the other keyframes as they follow it; ties : so many of the last factors tie parts
+    together, see `as_one`; pattern : of the last factorisation, None: there was none.
     """
 
     map: int
@@ -57,7 +56,6 @@ class Problem:
     judgement: Judgement
     robust: bool
     last_cost: float
-    settled: bool
     solved: Array
     ties: int = 0
     pattern: Pattern | None = None

@@ -86,15 +86,18 @@ class Robot:
 
 class Counts(NamedTuple):
     """
-    How large a graph is, and what was noted of messages.
+    How large a graph is, what was noted of messages, and what the last judgement says of the map.
 
     sizes : keyframes, factors and loops of each state, by name; refused : cause -> how many loops
-    were; told : how often the odometry did not go on as robots move, see `Notes.told`
+    were; told : how often the odometry did not go on as robots move, see `Notes.told`; verdict :
+    a judgement without its columns; stamps : (n,) [ns] of the keyframes that its doubts name
     """
 
     sizes: dict[str, int]
     refused: dict[str, int]
     told: dict[str, int]
+    verdict: Judgement
+    stamps: Indices
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ class Behind:
     age : [s] of the map that was factored, NaN: there is none; rows : of loops that came since;
     loops : not judged yet; bound : a lower bound on the L1 cost of all maps of the accepted
     factors near this one, and its age [s], NaN: nothing was proved of them; failing : the last
-    work failed, told or not.
+    work failed, told or not; at_rest : nothing is left to do, and loops are judged as by a batch.
     """
 
     age: float
@@ -114,16 +117,18 @@ class Behind:
     bound: float
     bound_age: float
     failing: bool
+    at_rest: bool
 
     @staticmethod
-    def of(state: MapState, loops: int, now: float, failing: bool) -> 'Behind':
+    def of(state: MapState, loops: int, now: float, failing: bool, at_rest: bool) -> 'Behind':
         """Return how far the work is behind a state, with `loops` loops in the graph."""
         carried = state.carried
         holds = state.table.is_proof_of_accepted
         waiting = 0 if state.all_judged(loops) else loops - max(state.judged.loops, 0)
         return Behind(
             now - state.made if carried else np.nan, carried.border if carried else 0, waiting,
-            state.bound if holds else np.nan, now - state.bound_at if holds else np.nan, failing)
+            state.bound if holds else np.nan, now - state.bound_at if holds else np.nan, failing,
+            at_rest)
 
 
 @dataclass(frozen=True)
@@ -242,11 +247,9 @@ class Snapshot:
         if state.judged.poses is not None and state.is_stale:
             # After a loop has closed, the L2 map of the judgement is nearer.
             starts.append(self._followed(state.judged.poses, self.poses))
-        grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
         judgement = self.judgement if state.pending is None else self._of_all(state.pending)
-        settled = not (grown or state.is_stale) and judgement.settled and last.at_rest
         return Problem(state.began, self.graph, starts, dual, judgement, state.robust,
-                       last.cost * rows / max(len(last.dual), 1), settled,
+                       last.cost * rows / max(len(last.dual), 1),
                        self._followed(last.poses, self.odometry), pattern=self.pattern)
 
     def optimised(self) -> Optimised:

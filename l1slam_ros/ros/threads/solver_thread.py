@@ -128,7 +128,7 @@ class SolverThread:
         self._behind_since = self._behind_since or time.monotonic()
         improvement = self._backend.update(
             self._parameters.options.update.budget, lambda: self._paused or self._closing, taken)
-        if improvement is None or improvement.judgement.settled:
+        if improvement is None or not self._backend.behind().loops:
             self._behind_since = 0.0
         return improvement
 

@@ -31,7 +31,7 @@ def world():
 def judged(graph):
     """Return what `robust_solve` does, as a back end finds it out that has heard all at once."""
     nothing = Judgement.nothing().extended(graph, True)
-    return judge(graph, odometry_poses(graph), nothing, np.inf)
+    return judge(graph, odometry_poses(graph), nothing)
 
 
 @pytest.mark.parametrize('kind', FALSE_LOOPS)

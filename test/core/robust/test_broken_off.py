@@ -83,7 +83,7 @@ def test_what_was_believed_before_it_failed_is_in_the_map(bad, failing):
 def test_what_is_known_while_the_map_grows_stays(bad, failing):
     known, poses = robust_solve(bad.graph)
     failing(1)
-    for found, kept in (judge(bad.graph, poses, known, np.inf),
+    for found, kept in (judge(bad.graph, poses, known),
                         robust_solve(bad.graph, known=(known, poses))):
         assert_array_equal(found.accepted, known.accepted)
         assert_array_equal(found.suspect, known.suspect)

@@ -8,8 +8,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The judgement while a graph grows: what is new, what is known, and what evidence makes of it."""
 
-import time
-
 import numpy as np
 import problems
 import pytest
@@ -44,12 +42,6 @@ def graph_of(*loops, trusted=()):
 def bad():
     """160 keyframes, 161 true loops and 70 false ones."""
     return spoilt(careful_world(160, 320), 'random', 70)
-
-
-def judged(world, judgement=None, deadline=np.inf):
-    """Return the judgement after looking at all of a world's graph, from the odometry on."""
-    judgement = Judgement.nothing() if judgement is None else judgement
-    return judge(world.graph, world.odometry, judgement.extended(world.graph, True), deadline)[0]
 
 
 # What is believed before anything was looked at
@@ -115,24 +107,10 @@ def test_who_stops_doubting_believes_what_was_rejected():
 
 
 def test_judging_again_changes_nothing(bad):
-    once, poses = judge(bad.graph, bad.odometry,
-                        Judgement.nothing().extended(bad.graph, True), np.inf)
-    twice, _ = judge(bad.graph, poses, once, np.inf)
+    once, poses = judge(bad.graph, bad.odometry, Judgement.nothing().extended(bad.graph, True))
+    twice, _ = judge(bad.graph, poses, once)
     assert_array_equal(twice.accepted, once.accepted)
     assert twice.settled
-
-
-def test_every_look_gets_on_however_short_the_time(bad):
-    """A deadline that has passed leaves one round, and the rest to the next look."""
-    judgement, passed = Judgement.nothing(), time.monotonic() - 1
-    accepted = [np.count_nonzero(bad.graph.between.is_odometry)]
-    while not judgement.settled or len(accepted) == 1:
-        judgement = judged(bad, judgement, passed)
-        accepted.append(np.count_nonzero(judgement.accepted))
-        assert not judgement.accepted[is_false(bad, bad.graph.between)].any()
-        assert len(accepted) < 20
-    assert len(accepted) > 2 and accepted[1] > accepted[0]
-    assert_array_equal(judgement.accepted, judged(bad).accepted)
 
 
 @pytest.mark.parametrize('trusted', [True, False])
@@ -145,7 +123,7 @@ def test_others_may_lean_on_what_is_trusted(trusted):
     for vouched in (trusted, False):
         graph.add_between(np.array([10]), np.array([100]), off,
                           np.diag([100.0, 100.0, 1e3])[None], vouched)
-    judgement, _ = judge(graph, poses, Judgement.nothing().extended(graph, True), np.inf)
+    judgement, _ = judge(graph, poses, Judgement.nothing().extended(graph, True))
     assert judgement.accepted[-2:].tolist() == [trusted, trusted]
 
 
@@ -154,7 +132,7 @@ def test_a_lie_that_was_believed_is_dropped_when_the_truth_comes(bad):
     believed = Judgement.nothing().extended(bad.graph, True)
     lie = int(np.flatnonzero(is_false(bad, bad.graph.between))[30])
     believed.accepted[lie], believed.suspect[lie] = True, False
-    judgement, poses = judge(bad.graph, bad.odometry, believed, np.inf)
+    judgement, poses = judge(bad.graph, bad.odometry, believed)
     assert not judgement.accepted[is_false(bad, bad.graph.between)].any()
     assert not judgement.suspect[lie] and judgement.sigmas[lie] > 4
     assert position_error(poses, bad.truth) < 0.2

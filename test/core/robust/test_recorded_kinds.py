@@ -181,7 +181,7 @@ def test_one_place_that_alone_joins_two_parts_is_doubtful(world, ends, doubted, 
     assert np.count_nonzero(~found.accepted) == len(ends)
     if believed:
         known = replace(found, accepted=np.ones(len(graph.between), bool))
-        found, _ = judge(graph, poses, known, np.inf)
+        found, _ = judge(graph, poses, known)
     count, (first, last) = doubted[believed], (min(ends)[0], max(j for _, j in ends))
     assert found.doubts == (Doubt(ONE_JOINS, count, first, last),) * (count > 0)
 

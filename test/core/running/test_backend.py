@@ -301,7 +301,7 @@ def test_a_loop_that_carries_all_it_closes_a_long_way_by_is_no_corner_to_stay_in
     graph.add_between(np.array([0]), np.array([n - 1]), se3.between(true[:1], true[-1:]),
                       np.diag(np.repeat([0.1, 0.005], 3) ** -2.0)[None])
     problem = Problem(0, graph, [chain], np.zeros(6 * n),
-                      Judgement.nothing().extended(graph, False), False, 1.0, False, chain)
+                      Judgement.nothing().extended(graph, False), False, 1.0, chain)
     solved = improve(problem, one_round(OptimiserOptions(), True), PLENTY)
     best = min(minimise_by(choose(AUTO, graph), graph, start, OptimiserOptions())[0].cost
                for start in (chain, true))
@@ -626,11 +626,11 @@ def test_a_large_map_comes_to_rest_though_no_update_ends_by_its_tests(world):
     options = replace(EVERY, solver=OptimiserOptions(outer_iterations=1))
     backend = played(world, options=options)
     settled(backend)
-    assert backend.snapshot().problem().settled
+    assert backend.behind().at_rest
     assert backend.snapshot().state.optimised.quiet_updates >= 5
     assert cost(world.graph, backend.poses) == pytest.approx(batch_of(world.graph).cost, rel=1e-3)
     play(backend, careful_world(151, 320), 150, 151)
-    assert not backend.snapshot().problem().settled
+    assert not backend.behind().at_rest
 
 
 def test_options_may_change_on_the_way(world):

@@ -20,6 +20,7 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.judgement import NORM, Doubt, Judgement
 from l1slam_ros.core.running.factor_table import FRONT, JUDGE, NOBODY, PERSON, FactorTable
 from l1slam_ros.core.running.improve import Improvement
+from l1slam_ros.core.running.keeper.schedule import Moment, Size, is_judge_due
 from l1slam_ros.core.running.map_state import Carried, MapState
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.solvers.optimality import Status
@@ -83,12 +84,12 @@ def test_what_the_front_took_stands_behind_what_was_judged():
 def test_a_judgement_of_other_factors_waits_for_its_map(graph):
     state = beginning([1, 1, 1, 1, 0]).taken([FITS, CHANCE], carried(7))
     same = state.judged_by(judgement([1, 1, 1, 1, 0, 1], suspect=[4]), POSES, 2, False,
-                           graph.between, 10.0)
+                           False, graph.between, 10.0)
     assert same.pending is None and not same.is_stale
     assert column(same, 'said_by') == 6 * [JUDGE] + [FRONT]
     assert column(same, 'suspect') == [0, 0, 0, 0, 1, 0, 1] and same.judged.loops == 2
     other = judgement([1, 1, 1, 1, 1, 1])
-    waiting = same.judged_by(other, POSES, 2, True, graph.between, 11.0)
+    waiting = same.judged_by(other, POSES, 2, True, False, graph.between, 11.0)
     assert waiting.pending is other and waiting.is_stale
     assert waiting.table is same.table
     # Made of what it accepts, and the front has looked once more at the last one.
@@ -101,9 +102,26 @@ def test_a_judgement_of_other_factors_waits_for_its_map(graph):
     assert adopted.bound == pytest.approx(6.9) and adopted.made == 12.0
     # One that came meanwhile goes on to wait.
     later = judgement([1, 1, 1, 1, 1, 1, 0])
-    both = waiting.judged_by(later, POSES, 3, True, graph.between, 12.0)
+    both = waiting.judged_by(later, POSES, 3, True, False, graph.between, 12.0)
     kept = both.adopted(improvement(made), carried(7), [FITS], other, graph.between, 1e-3, 13.0)
     assert kept.pending is later and kept.is_stale
+
+
+def test_what_is_held_is_asked_once_more_when_the_robot_stands(graph):
+    state, other = beginning([1, 1, 1, 1, 0, 0]), judgement([1, 1, 1, 1, 1, 1])
+    driving = state.judged_by(other, POSES, 2, True, True, graph.between, 10.0)
+    assert driving.pending is None and driving.table is state.table and driving.all_judged(2)
+    assert not driving.all_judged_anew(2)
+    size = Size(len(POSES), 3 * 6, 2, 6)
+    assert not is_judge_due(driving, size, Moment(11.0, True, quiet=1.0))
+    assert is_judge_due(driving, size, Moment(12.0, True, quiet=2.0))
+    assert not is_judge_due(driving, size, Moment(14.0, False))
+    stands = driving.judged_by(other, POSES, 2, True, False, graph.between, 12.0)
+    assert stands.pending is other and stands.all_judged_anew(2)
+    # What says nothing new is not held.
+    same = state.judged_by(
+        judgement([1, 1, 1, 1, 0, 0]), POSES, 2, True, True, graph.between, 10.0)
+    assert not same.judged.held and same.all_judged_anew(2)
 
 
 def test_without_a_new_look_what_stands_there_stays(graph):
@@ -141,7 +159,8 @@ def test_a_person_has_the_last_word(graph):
     assert column(told, 'said_by') == 4 * [JUDGE] + 3 * [PERSON]
     assert told.is_stale and not told.all_judged(3) and told.told(graph.between) is told
     # Nor do a judge or a front overrule it.
-    against = told.judged_by(judgement([1, 1, 1, 1, 0, 1, 0]), POSES, 3, True, graph.between, 1.0)
+    against = told.judged_by(
+        judgement([1, 1, 1, 1, 0, 1, 0]), POSES, 3, True, False, graph.between, 1.0)
     adopted = against.adopted(improvement(judgement([1, 1, 1, 1, 1, 0, 1])), carried(7), [],
                               against.pending, graph.between, 1e-3, 2.0)
     assert column(adopted, 'accepted') == [1, 1, 1, 1, 1, 0, 1] and not adopted.is_stale

@@ -36,8 +36,7 @@ def problem(manifold, *others):
     graph.append_between(i, j, manifold.between(from_world[i], poses[j]),
                          np.broadcast_to(np.eye(d), (len(i), d, d)))
     judgement = Judgement.nothing().extended(graph, False)
-    return as_one(Problem(0, graph, [poses], np.zeros(len(i) * d), judgement, False, 0.0, False,
-                          poses))
+    return as_one(Problem(0, graph, [poses], np.zeros(len(i) * d), judgement, False, 0.0, poses))
 
 
 def moved(manifold, poses, keyframes):
@@ -76,5 +75,5 @@ def test_a_map_of_one_part_has_no_ties():
     graph = FactorGraph(se2, 2)
     graph.append_between(np.array([0]), np.array([1]), se2.identity(1), np.eye(3)[None])
     judgement, poses = Judgement.nothing().extended(graph, False), se2.identity(2)
-    of = as_one(Problem(0, graph, [poses], np.zeros(3), judgement, False, 0.0, False, poses))
+    of = as_one(Problem(0, graph, [poses], np.zeros(3), judgement, False, 0.0, poses))
     assert of.ties == 0 and on_ties(of, judgement, poses) is poses

@@ -29,6 +29,8 @@ _FEWEST, _KEYFRAMES_EACH = 10, 200
 _PART_TAKEN = 1 / 3
 # [s] The period of judgements while loops come and none of them fits.
 _JUDGE_EVERY = 2.0
+# [s] A robot of which neither a keyframe nor a loop comes for so long stands.
+_STANDS = 2.0
 
 
 class Work(Enum):
@@ -65,13 +67,20 @@ class Moment(NamedTuple):
     """
     The present time [s], by any clock, and what else the decision depends on.
 
-    idle : no message came for a while; budget : [s] of the update; judging : the judge is at work
+    idle : no message came for a while; budget : [s] of the update; judging : the judge is at work;
+    quiet : [s] since a keyframe or a loop came
     """
 
     now: float
     idle: bool
     budget: float = 0.0
     judging: bool = False
+    quiet: float = 0.0
+
+    @property
+    def stands(self) -> bool:
+        """Whether the robot does not drive."""
+        return self.idle and self.quiet >= _STANDS
 
 
 def due(state: MapState, size: Size, moment: Moment) -> tuple[Work | None, Work | None]:
@@ -144,13 +153,15 @@ def is_judge_due(state: MapState, size: Size, moment: Moment) -> bool:
     """
     Return whether to judge all loops.
 
-    At rest it is due until all loops are judged from the graph alone. While messages come it is
+    At rest it is due until all loops are judged from the graph alone; if that was not taken, once
+    more when the robot stands. While messages come it is
     due where the budget is longer than a judgement takes, or where the last judgement is long ago;
     a shorter wait is enough where the front has left a loop that fits, or no front gates loops.
     """
-    if moment.idle:
-        return not state.all_judged_anew(size.loops)
     judged = state.judged
+    if moment.idle:
+        waits = judged.held and judged.anew == size.loops and not moment.stands
+        return not (waits or state.all_judged_anew(size.loops))
     soon = judged.wanted or state.carried is None
     pause = judged.took if soon else max(_JUDGE_EVERY, 2 * judged.took)
     has_time = moment.budget > judged.took or moment.now > judged.ended + pause

@@ -68,11 +68,18 @@ class Updates:
         # The revisions to which the map was updated last, and at which nothing was left to do.
         self._updated = 0
         self._rested = -1
+        # [s] When something had come last.
+        self._came = 0.0
 
     @property
     def failing(self) -> bool:
         """Whether the background work that ended last failed."""
         return self._workers.failing
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the last update found nothing left to do, and nothing has come since."""
+        return self._rested == self._keeper.revisions.now
 
     def update(self, budget: float, stopped: Stopped, idle: bool | None = None,
                waits: bool = True, taken: Callable[[], None] = lambda: None) -> Improvement | None:
@@ -85,7 +92,7 @@ class Updates:
         keeper = self._keeper
         with self._update_lock:
             self._workers.check()
-            if self._rested == keeper.revisions.now:
+            if self.at_rest:
                 return None
             before = keeper.state
             end = start + budget if waits else start
@@ -94,6 +101,7 @@ class Updates:
             # The content of a map that begins is not new.
             came = seen.grown > max(self._updated, keeper.state.began)
             self._updated = seen.now
+            self._came = start if came else self._came
             idle = not came if idle is None else idle
             # Before workers begin: on one core they would share it with whoever publishes.
             taken()
@@ -105,7 +113,9 @@ class Updates:
                 check()
                 if time.monotonic() >= end:
                     return self._account(before.began, took)
-            if came or not idle or keeper.state.last is not before.last:
+            # A judgement that was not taken is made once more when the robot stands.
+            if (came or not idle or keeper.state.last is not before.last
+                    or keeper.state.judged.held):
                 return self._account(before.began, took)
             # Work that failed since the check is still to do.
             self._workers.check()
@@ -125,16 +135,17 @@ class Updates:
         return outrun(state, size)
 
     def _account(self, began: int, took: float) -> Improvement:
-        state, _, size = self._keeper.look()
+        state = self._keeper.state
         if state.began != began:
             raise Interrupted
-        return state.account(size.loops, took)
+        return state.account(took)
 
     def _begin_due(self, idle: bool, budget: float, check: Check) -> bool:
         """Start the work that is due; return whether there is any."""
         # Asked before the state is read: work that ends in between makes other work due.
         busy = self._workers.busy
-        moment = Moment(time.monotonic(), idle, budget, self._workers.judge.busy)
+        now = time.monotonic()
+        moment = Moment(now, idle, budget, self._workers.judge.busy, now - self._came)
         state, _, size = self._keeper.look()
         make, judge = due(state, size, moment)
         for worker, piece in ((self._workers.mapper, make), (self._workers.judge, judge)):
@@ -182,7 +193,7 @@ class Updates:
         front = front_of(replace(problem, judgement=judgement), poses,
                          len(whole.graph.between), check)
         improvement = improvement.of_all(whole)
-        take_judgement(keeper, now, improvement.judgement, improvement.poses, True)
+        take_judgement(keeper, now, improvement.judgement, improvement.poses, True, True)
         keeper.adopt(improvement, front, improvement.judgement)
         return improvement
 
