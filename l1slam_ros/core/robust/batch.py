@@ -337,7 +337,7 @@ def judge(
     check : called before long steps, raises where the work shall stop
 
     """
-    first = Growth(straightened(graph, known.drift), check)
+    first = Growth(straightened(known.as_meant(graph), known.drift), check)
     settled = True
     growth = first
     try:
@@ -348,6 +348,7 @@ def judge(
                 settled = False
                 break
         reasons = doubts(growth) if settled else ()
-        return judgement_of(growth, reasons, settled, known.drift), growth.poses
+        judgement = judgement_of(growth, reasons, settled, known.drift)
+        return replace(judgement, meant=known.meant), growth.poses
     except _FAILURES as error:
         return known.broken_off(graph, error), poses

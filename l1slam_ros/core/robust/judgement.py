@@ -87,7 +87,8 @@ class Judgement:
     the factors that are there; drift : by how much more each metre of the odometry turns than it
     says [rad/m]; confidence : see `forecast`, NaN where nothing is recorded of such maps; terms :
     what that was made of, see `forecast`;
-    is_refusal_doubted : refused loops may be true.
+    is_refusal_doubted : refused loops may be true; meant : (2, k) the variance of each number of
+    odometry and of loops where nobody stated it, in units of what is stated; (0, 0): as stated.
     """
 
     accepted: Mask
@@ -102,6 +103,7 @@ class Judgement:
     confidence: float = float('nan')
     terms: Array = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
     is_refusal_doubted: bool = False
+    meant: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False, repr=False)
 
     @property
     def doubt(self) -> Doubt | None:
@@ -166,8 +168,15 @@ class Judgement:
 
     def believed(self, graph: FactorGraph) -> FactorGraph:
         """Return the accepted factors of a graph, as noisy as they are."""
-        straight = straightened(graph, self.drift)
+        straight = straightened(self.as_meant(graph), self.drift)
         return straight.subset(self.accepted, self.noise[self.accepted])
+
+    def as_meant(self, graph: FactorGraph) -> FactorGraph:
+        """Return a graph with the noise that was meant."""
+        if not len(self.meant):
+            return graph
+        is_loop = ~graph.between.is_odometry
+        return graph.subset(np.arange(len(is_loop)), self.meant[is_loop.astype(np.int64)])
 
     def found_variance(self, graph: FactorGraph) -> Array:
         """Return the variance that was found of these, in units of what they then state, (k,)."""
