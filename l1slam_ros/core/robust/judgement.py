@@ -244,7 +244,8 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), settled: bool 
     """
     Return what a state says of the factors that were given.
 
-    That another drift may be right is no reason where maps that looked like this one were right.
+    That another drift may be right is no reason where maps that looked like this one were right,
+    nor where none is taken that is the likelier by far.
 
     drift : that of the odometry [rad/m]; odds : ln of those of it against all others
     """
@@ -254,18 +255,23 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), settled: bool 
     size = given.size
     loops = given.is_loop[:size]
     unsure = unsureness(growth)
+    chance = float(1 / (1 + np.exp(-odds)))
+    if not drift and np.isfinite(odds) and chance >= CONFIDENT:
+        reasons = tuple(doubt for doubt in reasons if doubt.kind != DRIFTS)
     kinds = {doubt.kind for doubt in reasons}
-    terms = terms_of(bool((given.is_loop & growth.accepted).any()), unsure,
+    accepts_any = bool((given.is_loop & growth.accepted).any())
+    terms = terms_of(accepts_any, unsure,
                      *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
     confidence = forecast(terms) if loops.any() else float('nan')
     if odds < 0:
-        confidence = min(confidence, float(1 / (1 + np.exp(-odds))))
+        confidence = min(confidence, chance)
     reasons = tuple(
         doubt for doubt in reasons if doubt.kind != DRIFTS or not confidence >= CONFIDENT)
     left_out = np.flatnonzero(loops & ~believed.accepted)
-    # Where all loops came in, what the file states may be vague; there is nothing to settle. Of
-    # fewer loops than a run has nothing is recorded.
+    # Where no loop that was left out fits, so vague a map would have been found by all true ones,
+    # too; there is nothing to settle. Of fewer loops than a run has nothing is recorded.
     if (settled and len(left_out) and np.count_nonzero(loops) >= RUN
+            and (suspect[left_out].any() or not accepts_any)
             and forecast(terms[:3]) < CONFIDENT):
         metres = unsure * right_within(growth.given.graph.manifold.positions(growth.poses))
         reasons += (doubt_of(given.factors.pairs[left_out], growth.given.graph.n_poses, WEAK,
