@@ -64,27 +64,23 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
     By what is stated there, far too many loops that are off fit by chance. Where it states the
     identity, a radian is no metre either: what each is worth is found, and weighs the map.
     """
-    factors = graph.between
-    k = graph.manifold.TANGENT_SIZE
-    unsaid = [bool(np.allclose(roots, np.eye(k))) and len(roots) > 0 for roots in (
-        factors.sqrt_information[factors.is_odometry == is_odometry]
-        for is_odometry in (True, False))]
-    first = Judgement.nothing()
-    if any(unsaid) and not factors.is_absolute.any():
-        turns = np.ones((2, k))
-        turns[unsaid, graph.manifold.ROTATION] = _TURN
-        first = replace(first, meant=turns)
-    judgement, poses = judge(first.as_meant(graph), report, check, known)
-    found = np.full((2, 1), judgement.variance[0])
-    if len(first.meant):
-        found = _by_number(first.as_meant(graph), judgement, poses) * first.meant
-    elif found[0, 0] > _OVERSTATED or judgement.accepted.all() or factors.is_absolute.any():
+    factors, meant = graph.between, np.ones((2, graph.manifold.TANGENT_SIZE))
+    kind = (~factors.is_odometry).astype(np.int64)
+    for number, turns in enumerate(meant[:, graph.manifold.ROTATION]):
+        roots = factors.sqrt_information[kind == number]
+        if len(roots) and np.allclose(roots, np.eye(meant.shape[1])):
+            turns[:] = 1.0 if factors.is_absolute.any() else _TURN
+    rows = np.arange(len(factors))
+    first = graph if (meant == 1).all() else graph.subset(rows, meant[kind])
+    judgement, poses = judge(first, report, check, known)
+    if factors.is_absolute.any() or first is graph and (
+            judgement.variance[0] > _OVERSTATED or judgement.accepted.all()):
         return judgement, poses
-    judgement, poses = judge(replace(first, meant=found).as_meant(graph), report, check, None)
+    meant *= _by_number(first, judgement, poses)
+    judgement, poses = judge(graph.subset(rows, meant[kind]), report, check, None)
     # What odometry states stays as large, so that the next of it is worth as much.
-    times = float(np.exp(np.log(found[0]).mean()))
-    meant = found / times if len(first.meant) else first.meant
-    return replace(judgement, variance=judgement.variance * times, meant=meant), poses
+    times = np.exp(np.log(meant).mean(axis=1))
+    return replace(judgement, variance=judgement.variance * times, meant=meant / times[0]), poses
 
 
 def _by_number(graph: FactorGraph, judgement: Judgement, poses: Array) -> Array:

@@ -341,7 +341,7 @@ def judge(
     settled = True
     growth = first
     try:
-        first.resume(poses, known.accepted, known.variance)
+        first.resume(poses, known.accepted, known.variance_meant)
         for growth in rounds(first):
             # The end is not put off once it is in sight, or short budgets would never get there.
             if time.monotonic() > deadline and not growth.noise.at_their_word:
@@ -349,6 +349,8 @@ def judge(
                 break
         reasons = doubts(growth) if settled else ()
         judgement = judgement_of(growth, reasons, settled, known.drift)
-        return replace(judgement, meant=known.meant), growth.poses
+        units = known.variance / known.variance_meant
+        return replace(judgement, variance=judgement.variance * units,
+                       meant=known.meant), growth.poses
     except _FAILURES as error:
         return known.broken_off(graph, error), poses

@@ -88,7 +88,7 @@ class Judgement:
     says [rad/m]; confidence : see `forecast`, NaN where nothing is recorded of such maps; terms :
     what that was made of, see `forecast`;
     is_refusal_doubted : refused loops may be true; meant : (2, k) the variance of each number of
-    odometry and of loops where nobody stated it, in units of what is stated; (0, 0): as stated.
+    odometry and of loops, where nobody stated it, in units of what is stated.
     """
 
     accepted: Mask
@@ -103,7 +103,7 @@ class Judgement:
     confidence: float = float('nan')
     terms: Array = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
     is_refusal_doubted: bool = False
-    meant: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False, repr=False)
+    meant: Array = field(default_factory=lambda: np.ones((2, 1)), compare=False, repr=False)
 
     @property
     def doubt(self) -> Doubt | None:
@@ -173,7 +173,7 @@ class Judgement:
 
     def as_meant(self, graph: FactorGraph) -> FactorGraph:
         """Return a graph with the noise that was meant."""
-        if not len(self.meant):
+        if (self.meant == 1).all():
             return graph
         is_loop = ~graph.between.is_odometry
         return graph.subset(np.arange(len(is_loop)), self.meant[is_loop.astype(np.int64)])
@@ -182,7 +182,12 @@ class Judgement:
         """Return the variance that was found of these, in units of what they then state, (k,)."""
         loops = ~graph.between.is_odometry[self.accepted]
         # Where the part is as noisy as was found, odometry is its unit.
-        return self.variance[(loops & self.is_noise_stated).astype(np.int64)]
+        return self.variance_meant[(loops & self.is_noise_stated).astype(np.int64)]
+
+    @property
+    def variance_meant(self) -> Array:
+        """The variance of odometry and of loops as found, (2,), in units of what was meant."""
+        return self.variance / np.exp(np.log(self.meant).mean(axis=1))
 
     def extended(self, graph: FactorGraph, robust: bool) -> 'Judgement':
         """
@@ -200,7 +205,7 @@ class Judgement:
         sigmas = np.concatenate((self.sigmas, np.full(len(factors) - known, np.nan)))
         noise = np.ones(len(factors))
         if not self.is_noise_stated:
-            noise[~factors.is_odometry] = self.variance[1] / self.variance[0]
+            noise[~factors.is_odometry] = self.variance_meant[1] / self.variance_meant[0]
         noise[:len(self.noise)] = self.noise
         told = not np.array_equal(accepted[:known], self.accepted)
         return replace(
