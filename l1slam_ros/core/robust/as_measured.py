@@ -46,7 +46,9 @@ def as_measured(judge: Judge) -> Callable[..., Believed]:
     def judged(graph: FactorGraph, report: OnRound = lambda round_, accepted: None,
                check: Callable[[], None] = lambda: None,
                known: Believed | None = None) -> Believed:
-        rows, which = np.unique(first_told(graph), return_inverse=True)
+        factors = graph.between
+        told = ~factors.is_odometry & ~factors.is_absolute & ~factors.trusted
+        rows, which = np.unique(first_told(graph, np.flatnonzero(told)), return_inverse=True)
         if len(rows) == len(which):
             return _as_meant(judge, graph, report, check, known)
         before = known and (known[0].of_factors(rows), known[1])
