@@ -184,8 +184,7 @@ class FactorGraph:
         Parameters
         ----------
         chosen : rows (k,), or (m,) bool
-        variance : (k,) by which to multiply the covariance of each, or (k, d) of each of its
-            numbers, whitened; none: as they are
+        variance : (k,), or (k, d) of whitened numbers, to multiply covariances by; none: ones
 
         """
         part = self.without_factors()

@@ -19,6 +19,7 @@ from functools import wraps
 
 import numpy as np
 
+from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.inspection import FEWEST
@@ -32,6 +33,9 @@ _OVERSTATED = 0.003
 # [rad^2/m^2] Where a file says of a radian what it says of a metre, its variance is taken for so
 # many times that of a metre until it was found: a tenth to a hundredth is usual.
 _TURN = 1 / 30
+
+# What a factorisation, or numbers beyond double precision, end in.
+FAILURES = (GraphError, np.linalg.LinAlgError)
 
 # From the round and the loops accepted so far.
 OnRound = Callable[[int, int], None]
@@ -78,7 +82,10 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
     if factors.is_absolute.any() or first is graph and (
             judgement.variance[0] > _OVERSTATED or judgement.accepted.all()):
         return judgement, poses
-    meant *= _by_number(first, judgement, poses)
+    try:
+        meant *= _by_number(first, judgement, poses)
+    except FAILURES as error:
+        return judgement.broken_off(graph, error), poses
     judgement, poses = judge(graph.subset(rows, meant[kind]), report, check, None)
     # What odometry states stays as large, so that the next of it is worth as much.
     times = np.exp(np.log(meant).mean(axis=1))

@@ -58,13 +58,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l1slam_ros.core import kernels
-from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
-from l1slam_ros.core.robust.as_measured import Believed, OnRound, as_measured
+from l1slam_ros.core.robust.as_measured import FAILURES, Believed, OnRound, as_measured
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
 from l1slam_ros.core.robust.innovation import (
     BY_CHANCE,
@@ -97,9 +96,6 @@ from l1slam_ros.core.solvers.optimality import Status, l1_cost
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
 
-# What a factorisation, or numbers beyond double precision, end in.
-_FAILURES = (GraphError, np.linalg.LinAlgError)
-
 
 @as_measured
 def robust_solve(
@@ -130,7 +126,7 @@ def robust_solve(
             report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
         reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival)
         return judgement_of(growth, reasons, drift=repair.drift, odds=repair.odds), growth.poses
-    except _FAILURES as error:
+    except FAILURES as error:
         judgement, poses = known or last
         return judgement.broken_off(graph, error), poses
 
@@ -220,7 +216,7 @@ def minimise_robustly(
         solution = minimise(whole, seed)
         check()
         more = _norm_doubts(graph, judgement, whole, seed, solution.poses)
-    except _FAILURES as error:
+    except FAILURES as error:
         solution = _standing(judgement.believed(graph), poses)
         seed = poses
         more = (_unsolved(graph, judgement, error),)
@@ -249,7 +245,7 @@ def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
     try:
         whole, seed = _least_squares(graph, judgement, poses, check)
         return _norm_doubts(graph, judgement, whole, seed, poses)
-    except _FAILURES as error:
+    except FAILURES as error:
         return (_unsolved(graph, judgement, error),)
 
 
@@ -352,5 +348,5 @@ def judge(
         units = known.variance / known.variance_meant
         return replace(judgement, variance=judgement.variance * units,
                        meant=known.meant), growth.poses
-    except _FAILURES as error:
+    except FAILURES as error:
         return known.broken_off(graph, error), poses
