@@ -273,10 +273,12 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), settled: bool 
     reasons = tuple(
         doubt for doubt in reasons if doubt.kind != DRIFTS or not confidence >= CONFIDENT)
     left_out = np.flatnonzero(loops & ~believed.accepted)
-    # Where no loop that was left out fits, so vague a map would have been found by all true ones,
-    # too; there is nothing to settle. Of fewer loops than a run has nothing is recorded.
+    # Where no loop that was left out fits, so vague a map would have been made of all true ones,
+    # weighed as stated, too; there is nothing to settle. Of fewer loops than a run has nothing is
+    # recorded.
+    noise = _noise(growth)[:size]
     if (settled and len(left_out) and np.count_nonzero(loops) >= RUN
-            and (suspect[left_out].any() or not accepts_any)
+            and (suspect[left_out].any() or (noise != 1).any() or not accepts_any)
             and forecast(terms[:3]) < CONFIDENT):
         metres = unsure * right_within(growth.given.graph.manifold.positions(growth.poses))
         reasons += (doubt_of(given.factors.pairs[left_out], growth.given.graph.n_poses, WEAK,
@@ -284,7 +286,7 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), settled: bool 
     doubted = OTHER_MAP in kinds or bool(
         2 * len(left_out) > np.count_nonzero(loops) >= RUN)
     return replace(believed, suspect=suspect[:size], sigmas=np.sqrt(square[:size]),
-                   noise=_noise(growth)[:size], doubts=reasons, settled=settled,
+                   noise=noise, doubts=reasons, settled=settled,
                    confidence=confidence, terms=terms, is_refusal_doubted=doubted)
 
 
