@@ -83,7 +83,8 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
             judgement.variance[0] > _OVERSTATED or judgement.accepted.all()):
         return judgement, poses
     try:
-        meant *= _by_number(first, judgement, poses)
+        meant *= (judgement.variance[0] if first is graph
+                  else _by_number(first, judgement, poses))
     except FAILURES as error:
         return judgement.broken_off(graph, error), poses
     judgement, poses = judge(graph.subset(rows, meant[kind]), report, check, None)

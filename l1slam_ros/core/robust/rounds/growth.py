@@ -35,7 +35,7 @@ from l1slam_ros.core.robust.innovation import (
     sample_posterior,
 )
 from l1slam_ros.core.robust.inspection import FEWEST, OFF_SCALE
-from l1slam_ros.core.robust.places import beside_refused
+from l1slam_ros.core.robust.places import beside_refused, first_told
 from l1slam_ros.core.robust.rounds.evidence import evidence_of
 from l1slam_ros.core.robust.rounds.noise import Noise
 from l1slam_ros.core.solvers.block_cholesky import with_pattern
@@ -96,7 +96,9 @@ class Growth:
         self._tie_to_world()
         self.solve()
         rows = self.undecided()
-        rows = rows[~self.given.factors.is_absolute[rows]]
+        first = first_told(self.given.graph, np.arange(len(self.given.factors)))
+        # Odometry that stands there twice fits itself, whatever the noise.
+        rows = rows[~self.given.factors.is_absolute[rows] & (first[rows] == rows)]
         # Else the noise that is learnt of them would fit their mistake.
         if not self.given.may_err_as_one(rows):
             self.noise = self.noise.found(
