@@ -44,7 +44,6 @@ RULES: dict[str, Callable[..., Any]] = {
     'gating.together': lambda *_: _NONE,
     'places.beside_refused': lambda pairs, refused, true: np.zeros(len(refused)),
     'places.err_together': lambda *_: False,
-    'inspection.repeated_factors': lambda graph: _NONE,
     'rounds.growth.Growth._is_noisier': lambda growth, rows: False,
     'rounds.growth.Growth._misfits': lambda growth, rows, residual: _NONE,
     'rounds.growth.Growth.accept_tail': lambda growth: None,

@@ -20,6 +20,7 @@ from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.names import ANGLE, QUATERNION
 from l1slam_ros.core.robust import inspection
+from l1slam_ros.core.robust.places import first_told
 from l1slam_ros.io.files import NANOSECONDS, counted, stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.robots import robot_names, robots_of
@@ -127,7 +128,8 @@ def _on_gaps(record: GraphRecord) -> Iterator[str]:
 
 
 def _on_repetitions(record: GraphRecord) -> Iterator[str]:
-    repeated = inspection.repeated_factors(record.graph)
+    rows = np.arange(len(record.graph.between))
+    repeated = np.flatnonzero(first_told(record.graph, rows) != rows)
     if len(repeated):
         yield (f'{_listed("edge", _edges(record, repeated), len(repeated))}: given before with '
                'the same measurement, so counted twice')

@@ -128,5 +128,5 @@ def _of_step(record: GraphRecord, judgement: Judgement, doubt: Doubt, number: in
         step = f'{record.ids[doubt.first]} - {record.ids[doubt.last]}'
         word = 'with' if believed[rows[0]] else 'without'
         yield _Plan(f'{word} the step {step}', number,
-                    straightened(record.graph, judgement.drift).subset(
+                    straightened(judgement.as_meant(record.graph), judgement.drift).subset(
                         believed, judgement.noise[believed]), believing)

@@ -184,14 +184,14 @@ class FactorGraph:
         Parameters
         ----------
         chosen : rows (k,), or (m,) bool
-        variance : (k,) by which to multiply the covariance of each, none: as they are
+        variance : (k,), or (k, d) of whitened numbers, to multiply covariances by; none: ones
 
         """
         part = self.without_factors()
         i, j, measurement, root, trusted, struck = (
             column.view()[chosen] for column in self._between)
         if variance is not None:
-            root = root / np.sqrt(variance)[:, None, None]
+            root = root / np.sqrt(np.atleast_2d(variance.T).T)[:, :, None]
         part.append_between(i, j, measurement, root, trusted, struck)
         return part
 

@@ -57,13 +57,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l1slam_ros.core import kernels
-from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
-from l1slam_ros.core.robust.as_measured import Believed, OnRound, as_measured
+from l1slam_ros.core.robust.as_measured import FAILURES, Believed, OnRound, as_measured
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
 from l1slam_ros.core.robust.innovation import (
     BY_CHANCE,
@@ -96,9 +95,6 @@ from l1slam_ros.core.solvers.optimality import Status, l1_cost
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
 
-# What a factorisation, or numbers beyond double precision, end in.
-_FAILURES = (GraphError, np.linalg.LinAlgError)
-
 
 @as_measured
 def robust_solve(
@@ -129,7 +125,7 @@ def robust_solve(
             report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
         reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival)
         return judgement_of(growth, reasons, drift=repair.drift, odds=repair.odds), growth.poses
-    except _FAILURES as error:
+    except FAILURES as error:
         judgement, poses = known or last
         return judgement.broken_off(graph, error), poses
 
@@ -219,7 +215,7 @@ def minimise_robustly(
         solution = minimise(whole, seed)
         check()
         more = _norm_doubts(graph, judgement, whole, seed, solution.poses)
-    except _FAILURES as error:
+    except FAILURES as error:
         solution = _standing(judgement.believed(graph), poses)
         seed = poses
         more = (_unsolved(graph, judgement, error),)
@@ -248,7 +244,7 @@ def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
     try:
         whole, seed = _least_squares(graph, judgement, poses, check)
         return _norm_doubts(graph, judgement, whole, seed, poses)
-    except _FAILURES as error:
+    except FAILURES as error:
         return (_unsolved(graph, judgement, error),)
 
 
@@ -335,10 +331,13 @@ def judge(
     check : called before long steps, raises where the work shall stop
 
     """
-    first = Growth(straightened(graph, known.drift), check)
+    first = Growth(straightened(known.as_meant(graph), known.drift), check)
     try:
-        first.resume(poses, known.accepted, known.variance)
+        first.resume(poses, known.accepted, known.variance_meant)
         *_, growth = rounds(first)
-        return judgement_of(growth, doubts(growth), drift=known.drift), growth.poses
-    except _FAILURES as error:
+        judgement = judgement_of(growth, doubts(growth), drift=known.drift)
+        units = known.variance / known.variance_meant
+        return replace(judgement, variance=judgement.variance * units,
+                       meant=known.meant), growth.poses
+    except FAILURES as error:
         return known.broken_off(graph, error), poses

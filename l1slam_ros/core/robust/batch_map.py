@@ -219,10 +219,9 @@ class _Minimiser:
 
 def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Array | None:
     """Return the step (k,) that accepted loops lack in a map (n, p); see `lacked_step`."""
-    rows = judgement.accepted
+    variance = judgement.found_variance(graph)
     part, keyframes, is_loop = densest_part(
-        straightened(graph, judgement.drift).subset(
-            rows, judgement.noise[rows] * judgement.found_variance(graph)))
+        judgement.believed(graph).subset(np.arange(len(variance)), variance))
     if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < FEWEST:
         return None
     cholesky = cholesky_of(part)

@@ -21,7 +21,12 @@ import numpy as np
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.robust.innovation import Innovations, Posterior, log_likelihood_ratio
+from l1slam_ros.core.robust.innovation import (
+    BY_CHANCE,
+    Innovations,
+    Posterior,
+    log_likelihood_ratio,
+)
 
 # What squares of true factors stay below, by their freedom.
 Gate = Callable[[Indices], Array]
@@ -29,10 +34,8 @@ Gate = Callable[[Indices], Array]
 # Of factors that are believed at one time, any is false with at most this probability. Of 89 runs
 # (benchmarks/robust/SENSITIVITY.md, as all such counts) half makes 4 worse, double 2.
 DOUBT = 0.01
-# Of places of which many are believed at one time, this part is false at most: for fewer rounds;
-# half and double change no run of 89.
-_FALSE_PLACES = 1e-3
-# That holds where no more than two of three loops lie, ln of odds: with nine of ten, all of one
+# Of places of which many are believed at one time, no larger part is false than of true loops is
+# refused, where no more than two of three loops lie, ln of odds: with nine of ten, all of one
 # claim, sphere2500 kept lies. Where half lie, it takes as few rounds as without this.
 _MOST_LIE = np.log(2)
 # Where no more than this part of all are believed by themselves, others are for what they say
@@ -40,7 +43,7 @@ _MOST_LIE = np.log(2)
 _FEW = 2e-3
 # The noise is judged by so many of the best predicted factors; half and double make none worse.
 _BEST_PREDICTED = 1000
-_ROUNDS = 100
+# Rounds of expectation and maximisation end where a part of what they find is the same.
 _SAME = 1e-3
 # How much more the loops' variance may be off than the odometry's, as said or else; another ratio
 # has to make each loop likelier by so much, ln. Half and double change none, but with none FR079's
@@ -49,9 +52,6 @@ _RATIOS = (1.0, *(10.0**power for power in range(-6, 7) if power))
 _RATIO_COSTS = 0.25
 # Variances are no less, where they would be nothing.
 TINY = 1e-9
-# A factor of ten that files are off has to be worth so much, ln: a few lies are no measure. Half
-# and double make none worse.
-_DECADE_COSTS = 5.0
 # Pairs are formed of so many factors that fit best; half and double change 8 and 5, none is worse.
 # By 250 a recorded log, Intel, gets a slip that is none.
 _CANDIDATES = 200
@@ -66,13 +66,11 @@ def log_odds_of_false(log_ratio: Array, others: int, believed: int = 0) -> float
     still says how sure that is.
     """
     count = len(log_ratio) + others + believed
-    odds = 0.0
-    for _ in range(_ROUNDS):
-        true = float(probability(log_ratio - odds).sum()) + believed + 1
+    odds, before = 0.0, np.inf
+    while abs(odds - before) >= _SAME:
         before = odds
+        true = float(probability(log_ratio - odds).sum()) + believed + 1
         odds = float(np.log((count + 2 - true) / true))
-        if abs(odds - before) < _SAME:
-            break
     return odds
 
 
@@ -117,7 +115,7 @@ def at_once(log_odds: Array, place: Indices, well: Mask) -> Indices:
     Return which may be believed, all of them at once, surest first.
 
     As many as are all true but for `DOUBT`. Of those that fit well, as many as no more than
-    `_FALSE_PLACES` of their places are expected to be false of, and `DOUBT` of one more place, so
+    `BY_CHANCE` of their places are expected to be false of, and `DOUBT` of one more place, so
     that of few none is given away (the false discovery rate of Y. Benjamini and Y. Hochberg,
     1995). A place may have been mistaken as a whole: it counts once, by its most doubtful factor.
 
@@ -133,7 +131,7 @@ def at_once(log_odds: Array, place: Indices, well: Mask) -> Indices:
     more[again] -= doubt[by_place[:-1][same]]
     first = np.ones(len(doubt), bool)
     first[again] = False
-    few = np.flatnonzero(DOUBT + np.cumsum(more) < _FALSE_PLACES * np.cumsum(first))
+    few = np.flatnonzero(DOUBT + np.cumsum(more) < BY_CHANCE * np.cumsum(first))
     among_few = np.arange(len(doubt)) <= few.max(initial=-1)
     good: Indices = order[(np.cumsum(doubt) < DOUBT) | (among_few & well[order])]
     return good
@@ -231,7 +229,8 @@ def noise_variance(found: Innovations) -> Array:
         log_det -= (k - freedom) * np.log(ratio)  # what says nothing has no noise
         for start in (1.0, *(np.quantile(square, (0.1, 0.5)) / k).tolist()):
             likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, k, start)
-            costs = _RATIO_COSTS * len(best) * (ratio != 1) + _DECADE_COSTS * (
+            # A factor of ten that files are off is as unlikely as a lie among what is believed.
+            costs = _RATIO_COSTS * len(best) * (ratio != 1) - np.log(DOUBT) * (
                 abs(np.log10(scale)) + abs(np.log10(ratio)))
             fits.append((likelihood - costs, scale, ratio))
     _, scale, ratio = max(fits)
@@ -241,8 +240,9 @@ def noise_variance(found: Innovations) -> Array:
 def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indices, k: int,
                   start: float) -> tuple[float, float]:
     """Return the log likelihood of the best scale of C near a start, and that scale."""
-    scale = start = max(start, TINY)
-    for _ in range(_ROUNDS):
+    scale, before = max(start, TINY), np.inf
+    start = scale
+    while abs(scale / before - 1) >= _SAME:
         log_ratio = log_likelihood_ratio(square / scale, log_det + freedom * np.log(scale),
                                          log_claim, freedom, k)
         odds = log_odds_of_false(log_ratio, 0)
@@ -250,7 +250,5 @@ def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indi
         # The one pseudo-factor at the start is for crowds without a true one.
         before = scale
         scale = float((true @ square + start) / (true @ freedom + 1))
-        if abs(scale / before - 1) < _SAME:
-            break
     likelihood = np.logaddexp(log_ratio - odds, 0.0).sum() - len(square) * np.logaddexp(0, -odds)
     return float(likelihood), scale

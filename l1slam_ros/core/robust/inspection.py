@@ -55,15 +55,6 @@ OFF_SCALE = 3.0
 _SHOWS = 0.1
 
 
-def repeated_factors(graph: FactorGraph) -> Indices:
-    """Return the factors with the pair and the measurement of an earlier one, (k,)."""
-    factors = graph.between
-    rows = parallel_factors(graph)
-    table = np.column_stack((factors.i[rows], factors.j[rows], factors.measurement[rows]))
-    _, first = np.unique(table, axis=0, return_index=True)
-    return np.delete(rows, first)
-
-
 def parallel_factors(graph: FactorGraph) -> Indices:
     """Return the factors that share their pair of keyframes, either way round, (k,)."""
     factors = graph.between

@@ -87,7 +87,8 @@ class Judgement:
     the factors that are there; drift : by how much more each metre of the odometry turns than it
     says [rad/m]; confidence : see `forecast`, NaN where nothing is recorded of such maps; terms :
     what that was made of, see `forecast`;
-    is_refusal_doubted : refused loops may be true.
+    is_refusal_doubted : refused loops may be true; meant : (2, k) the variance of each number of
+    odometry and of loops, where nobody stated it, in units of what is stated.
     """
 
     accepted: Mask
@@ -102,6 +103,7 @@ class Judgement:
     confidence: float = float('nan')
     terms: Array = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
     is_refusal_doubted: bool = False
+    meant: Array = field(default_factory=lambda: np.ones((2, 1)), compare=False, repr=False)
 
     @property
     def doubt(self) -> Doubt | None:
@@ -166,14 +168,26 @@ class Judgement:
 
     def believed(self, graph: FactorGraph) -> FactorGraph:
         """Return the accepted factors of a graph, as noisy as they are."""
-        straight = straightened(graph, self.drift)
+        straight = straightened(self.as_meant(graph), self.drift)
         return straight.subset(self.accepted, self.noise[self.accepted])
+
+    def as_meant(self, graph: FactorGraph) -> FactorGraph:
+        """Return a graph with the noise that was meant."""
+        if (self.meant == 1).all():
+            return graph
+        is_loop = ~graph.between.is_odometry
+        return graph.subset(np.arange(len(is_loop)), self.meant[is_loop.astype(np.int64)])
 
     def found_variance(self, graph: FactorGraph) -> Array:
         """Return the variance that was found of these, in units of what they then state, (k,)."""
         loops = ~graph.between.is_odometry[self.accepted]
         # Where the part is as noisy as was found, odometry is its unit.
-        return self.variance[(loops & self.is_noise_stated).astype(np.int64)]
+        return self.variance_meant[(loops & self.is_noise_stated).astype(np.int64)]
+
+    @property
+    def variance_meant(self) -> Array:
+        """The variance of odometry and of loops as found, (2,), in units of what was meant."""
+        return self.variance / np.exp(np.log(self.meant).mean(axis=1))
 
     def extended(self, graph: FactorGraph, robust: bool) -> 'Judgement':
         """
@@ -191,7 +205,7 @@ class Judgement:
         sigmas = np.concatenate((self.sigmas, np.full(len(factors) - known, np.nan)))
         noise = np.ones(len(factors))
         if not self.is_noise_stated:
-            noise[~factors.is_odometry] = self.variance[1] / self.variance[0]
+            noise[~factors.is_odometry] = self.variance_meant[1] / self.variance_meant[0]
         noise[:len(self.noise)] = self.noise
         told = not np.array_equal(accepted[:known], self.accepted)
         return replace(
@@ -235,7 +249,8 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float =
     """
     Return what a state says of the factors that were given.
 
-    That another drift may be right is no reason where maps that looked like this one were right.
+    That another drift may be right is no reason where maps that looked like this one were right,
+    nor where none is taken that is the likelier by far.
 
     drift : that of the odometry [rad/m]; odds : ln of those of it against all others
     """
@@ -245,18 +260,25 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float =
     size = given.size
     loops = given.is_loop[:size]
     unsure = unsureness(growth)
+    chance = float(1 / (1 + np.exp(-odds)))
+    if not drift and np.isfinite(odds) and chance >= CONFIDENT:
+        reasons = tuple(doubt for doubt in reasons if doubt.kind != DRIFTS)
     kinds = {doubt.kind for doubt in reasons}
-    terms = terms_of(bool((given.is_loop & growth.accepted).any()), unsure,
+    accepts_any = bool((given.is_loop & growth.accepted).any())
+    terms = terms_of(accepts_any, unsure,
                      *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
     confidence = forecast(terms) if loops.any() else float('nan')
     if odds < 0:
-        confidence = min(confidence, float(1 / (1 + np.exp(-odds))))
+        confidence = min(confidence, chance)
     reasons = tuple(
         doubt for doubt in reasons if doubt.kind != DRIFTS or not confidence >= CONFIDENT)
     left_out = np.flatnonzero(loops & ~believed.accepted)
-    # Where all loops came in, what the file states may be vague; there is nothing to settle. Of
-    # fewer loops than a run has nothing is recorded.
+    # Where no loop that was left out fits, so vague a map would have been made of all true ones,
+    # weighed as stated, too; there is nothing to settle. Of fewer loops than a run has nothing is
+    # recorded.
+    noise = _noise(growth)[:size]
     if (len(left_out) and np.count_nonzero(loops) >= RUN
+            and (suspect[left_out].any() or (noise != 1).any() or not accepts_any)
             and forecast(terms[:3]) < CONFIDENT):
         metres = unsure * right_within(growth.given.graph.manifold.positions(growth.poses))
         reasons += (doubt_of(given.factors.pairs[left_out], growth.given.graph.n_poses, WEAK,
@@ -264,7 +286,7 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float =
     doubted = OTHER_MAP in kinds or bool(
         2 * len(left_out) > np.count_nonzero(loops) >= RUN)
     return replace(believed, suspect=suspect[:size], sigmas=np.sqrt(square[:size]),
-                   noise=_noise(growth)[:size], doubts=reasons, confidence=confidence, terms=terms,
+                   noise=noise, doubts=reasons, confidence=confidence, terms=terms,
                    is_refusal_doubted=doubted)
 
 

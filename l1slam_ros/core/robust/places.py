@@ -36,16 +36,17 @@ _SAME = 1e-4
 _GRAIN = 0.1
 
 
-def first_told(graph: FactorGraph) -> Indices:
+def first_told(graph: FactorGraph, left: Indices) -> Indices:
     """
     Return for each factor the first that says the same of the same keyframes, (m,), mostly itself.
 
     Front ends write a loop twice, or from either end. It was measured once, and is no witness of
-    itself. What is odometry, absolute or vouched for stands for itself.
+    itself.
+
+    left : (k,) the factors that are compared, any other stands for itself
     """
-    factors, first = graph.between, np.arange(len(graph.between))
+    first = np.arange(len(graph.between))
     low, high, Z = ends_in_time(graph)
-    left = np.flatnonzero(~factors.is_odometry & ~factors.is_absolute & ~factors.trusted)
     while len(left):
         _, at, pair = np.unique(pair_key(low[left], high[left], graph.n_poses),
                                 return_index=True, return_inverse=True)

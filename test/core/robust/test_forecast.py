@@ -13,11 +13,13 @@ import pytest
 from lies import careful_world
 from problems import chain_of, graph_of
 
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import robust_solve, rounds
 from l1slam_ros.core.robust.forecast import CONFIDENT, forecast, terms_of
 from l1slam_ros.core.robust.judgement import DRIFTS, WEAK, judgement_of
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.growth import Growth
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 
 
 def out_and_back(drift, legs=3, length=60, seed=0):
@@ -69,6 +71,22 @@ def test_a_map_without_an_accepted_loop_is_hardly_ever_right():
     found, _ = robust_solve(graph)
     assert [doubt.kind for doubt in found.doubts] == [WEAK]
     assert found.confidence < 0.2 and forecast(found.terms) == found.confidence
+
+
+@pytest.mark.parametrize('seed, noisier', [(0, 10), (3, 6), (6, 10), (7, 6)])
+def test_a_vague_map_that_no_loop_left_out_fits_is_the_one_of_all_true_loops(seed, noisier):
+    """It is unsure of itself for the odometry, which no loop that is left out would mend."""
+    rng = np.random.default_rng(seed)
+    graph = out_and_back(0.0, seed=seed)
+    steps = graph.between.is_odometry
+    noise = rng.normal(0, 1, (np.count_nonzero(steps), 3)) * [0.05, 0.05, 0.005]
+    graph.between.measurement[steps] += noisier * noise
+    true = np.concatenate((np.flatnonzero(steps), rng.choice(np.flatnonzero(~steps), 14, False)))
+    graph = graph.subset(np.sort(true))
+    lies = FALSE_LOOPS['random'](graph, odometry_poses(graph), 5, rng)
+    found, _ = robust_solve(insert_loops(graph, lies))
+    assert found.accepted.sum() == len(true)
+    assert forecast(found.terms) < CONFIDENT and not found.doubts
 
 
 def test_each_reason_lowers_the_forecast():

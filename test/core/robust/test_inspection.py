@@ -25,9 +25,9 @@ from l1slam_ros.core.robust.inspection import (
     long_steps,
     noise_scales,
     parallel_factors,
-    repeated_factors,
     step_lengths,
 )
+from l1slam_ros.core.robust.places import first_told
 from l1slam_ros.core.worlds.false_loops import insert_loops, random_false_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import read_graph_file
@@ -42,6 +42,11 @@ def graph_of(n, pairs, measurement=(1.0, 0.0, 0.0), information=((1, 0, 0), (0, 
     graph.add_between(i, j, np.broadcast_to(measurement, (m, 3)),
                       np.broadcast_to(information, (m, 3, 3)))
     return graph
+
+
+def repeated_factors(graph):
+    rows = np.arange(len(graph.between))
+    return np.flatnonzero(first_told(graph, rows) != rows)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 from problems import graph_of, retold, straight
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.robust.innovation import LEAST_RATIO, stated_variance, within_ratio
 from l1slam_ros.core.worlds.simulate import WorldOptions
 
@@ -78,3 +78,23 @@ def test_only_the_smaller_variance_is_raised_and_only_beyond_the_ratio():
     assert_allclose(within_ratio(np.array([1e-9, 1.0]), np.ones(2)), [LEAST_RATIO, 1.0])
     assert_allclose(within_ratio(np.array([1e-9, 1.0]), np.array([1e5, 1.0])), [1e-9, 1.0])
     assert_allclose(within_ratio(np.array([1.0, 1e-3]), np.array([1.0, 1e-4])), [1.0, 1e-1])
+
+
+@pytest.mark.parametrize('seed', [0, 3])
+def test_of_the_identity_what_a_turn_is_worth_is_found_and_weighs_the_map(seed):
+    """A radian is no metre: as if it were, right loops make a map that is twice as far off."""
+    bad = spoilt(laps(600, 3, 90, USUAL, np.random.default_rng(seed)), 'random', 60)
+    factors = bad.graph.between
+    says_nothing = retold(bad.graph)
+    says_nothing.between.sqrt_information[:] = np.eye(3)
+    judgement, poses = robust_solve(says_nothing)
+    lies = is_false(bad, factors)
+    assert not judgement.doubts
+    np.testing.assert_array_equal(judgement.accepted, ~lies)
+    as_stated = robust_solve(bad.graph)[1]
+    assert position_error(poses, bad.truth) < 1.1 * position_error(as_stated, bad.truth)
+    turns = judgement.meant[:, 2] / judgement.meant[:, 0]
+    assert (turns < 0.1).all()
+    again, _ = judge(says_nothing, poses, judgement)
+    np.testing.assert_array_equal(again.accepted, judgement.accepted)
+    assert_allclose(again.variance, judgement.variance, rtol=0.3)

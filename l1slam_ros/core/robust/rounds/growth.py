@@ -34,8 +34,8 @@ from l1slam_ros.core.robust.innovation import (
     innovations,
     sample_posterior,
 )
-from l1slam_ros.core.robust.inspection import FEWEST, repeated_factors
-from l1slam_ros.core.robust.places import beside_refused
+from l1slam_ros.core.robust.inspection import FEWEST, OFF_SCALE
+from l1slam_ros.core.robust.places import beside_refused, first_told
 from l1slam_ros.core.robust.rounds.evidence import evidence_of
 from l1slam_ros.core.robust.rounds.noise import Noise
 from l1slam_ros.core.solvers.block_cholesky import with_pattern
@@ -52,7 +52,7 @@ _TAIL = 2.0
 # Noise that is so many times the variance that was found is measured anew before any loop is
 # dropped for it, by the median of factors that others check; so many times what is stated, the
 # odometry may drift.
-NOISIER = 3.0
+NOISIER = OFF_SCALE
 # So often noise is learnt anew of other factors: each time half of what it was before may stay.
 _LEARNT_ANEW = 8
 # While driving so many of the last absolute factors are looked at, with their neighbours.
@@ -96,9 +96,9 @@ class Growth:
         self._tie_to_world()
         self.solve()
         rows = self.undecided()
-        # A factor that stands there twice fits itself, whatever the noise.
-        rows = np.setdiff1d(rows[~self.given.factors.is_absolute[rows]],
-                            repeated_factors(self.given.graph))
+        first = first_told(self.given.graph, np.arange(len(self.given.factors)))
+        # Odometry that stands there twice fits itself, whatever the noise.
+        rows = rows[~self.given.factors.is_absolute[rows] & (first[rows] == rows)]
         # Else the noise that is learnt of them would fit their mistake.
         if not self.given.may_err_as_one(rows):
             self.noise = self.noise.found(
