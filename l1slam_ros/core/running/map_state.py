@@ -197,13 +197,14 @@ class MapState(NamedTuple):
         """
         Return the state after a judgement of so many loops, of which poses (n, p) is the L2 map.
 
-        A judgement that accepts other factors than the map uses, or corrects them otherwise, is
-        pending until a map is made of it; anew : it is from the graph alone; held : such a one is
+        A judgement that accepts other factors than the map uses, or corrects or weighs them
+        otherwise, is pending until a map is made of it; anew : it is from the graph alone; held : such a one is
         not taken, but made once more when the robot stands
         """
         accepted = self.table.accepted[:len(judgement.accepted)]
-        same = judgement.drift == self.of_all.drift and np.array_equal(
-            judgement.accepted, accepted)
+        same = (judgement.drift == self.of_all.drift
+                and np.array_equal(judgement.meant, self.of_all.meant)
+                and np.array_equal(judgement.accepted, accepted))
         if held and not same:
             judged = self.judged.after(judgement, self.judged.poses, loops, anew, now)
             return self._replace(judged=replace(judged, held=True))

@@ -92,6 +92,8 @@ def test_a_judgement_of_other_factors_waits_for_its_map(graph):
     waiting = same.judged_by(other, POSES, 2, True, False, graph.between, 11.0)
     assert waiting.pending is other and waiting.is_stale
     assert waiting.table is same.table
+    weighed = replace(judgement([1, 1, 1, 1, 0, 1]), meant=np.array([[1.0, 1, 30], [1, 1, 30]]))
+    assert same.judged_by(weighed, POSES, 2, True, False, graph.between, 11.0).is_stale
     # Made of what it accepts, and the front has looked once more at the last one.
     made = judgement([1, 1, 1, 1, 1, 1, 0])
     adopted = waiting.adopted(improvement(made), carried(7), [FITS], other, graph.between, 1e-3,
