@@ -125,10 +125,9 @@ def _clean_map(graph: FactorGraph, chordal: Array, cholesky: BlockCholesky) -> A
 
 def is_near(graph: FactorGraph, poses: Array) -> bool:
     """
-    Tell whether poses (n, p) of a large graph are as good a start of an exact map as its L2 map.
+    Tell whether poses (n, p) of a large graph lie within one step of its L2 map.
 
-    Measured from 15,000 to 50,000 keyframes: where all fits to within the noise, a step towards
-    the L2 map, which takes as long as one of the exact map, spares none of these; else it does.
+    They do where all fits to within the noise.
     """
     return _is_large(graph) and _is_clean(graph, poses)
 

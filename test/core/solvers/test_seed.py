@@ -23,7 +23,7 @@ from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point
 from l1slam_ros.core.solvers.gauss_newton import ROUGH_L2, LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
-from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 from l1slam_ros.core.solvers.seed import chordal_poses, first_poses, seed_poses
 from l1slam_ros.core.worlds.false_loops import random_false_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
@@ -35,6 +35,10 @@ def seed_of(graph):
 
 def cost(graph, poses):
     return l1_cost(whitened_residual(graph, poses))
+
+
+def l2_cost_at(graph, poses):
+    return l2_cost(whitened_residual(graph, poses))
 
 
 def part(graph, poses, tangent):
@@ -178,6 +182,19 @@ def test_a_clean_graph_is_solved_from_its_l2_map(sigma, rng):
              for start in (poses, seed_poses(graph, cholesky))]
     assert found[0].cost <= found[1].cost * (1 + 6e-6)
     assert found[0].outer_iterations <= found[1].outer_iterations + 2
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.usefixtures('no_graph_is_small')
+def test_exact_l1_begins_one_step_nearer_the_l2_map_of_a_clean_graph(seed):
+    """From the poses as they are some place of a large graph bends more than first steps may."""
+    graph = simulate_world(2000, 4000, WorldOptions(), np.random.default_rng(seed)).graph
+    cholesky = cholesky_of(graph)
+    poses = first_poses(graph, cholesky)
+    begun = minimise_interior_point(graph, poses, OptimiserOptions(outer_iterations=1), cholesky)
+    best = l2_cost_at(graph, minimise_l2(graph, poses, LeastSquaresOptions(), cholesky).poses)
+    assert l2_cost_at(graph, poses) > best * (1 + 1e-3)
+    assert l2_cost_at(graph, begun.poses) == pytest.approx(best, rel=1e-4)
 
 
 @pytest.mark.usefixtures('no_graph_is_small')
