@@ -48,7 +48,7 @@ A doubt
     is a rival explanation nearly as good as the one that won: `reasons` names it.
 
 No loop is factored before it is accepted, so none bends what it is judged by. Read on in `rounds`,
-`gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `cuts`, `together`, `slips`.
+`gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `untold`, `cuts`, `slips`.
 """
 
 from collections.abc import Callable, Iterator

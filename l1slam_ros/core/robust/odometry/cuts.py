@@ -20,16 +20,16 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
 from l1slam_ros.core.graph.spanning_tree import pair_key, parents
+from l1slam_ros.core.robust.innovation import claimed_volume
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
     log_odds_of_slips,
     steps_of,
     unwhitening,
 )
-from l1slam_ros.core.robust.odometry.untold import slips_told
+from l1slam_ros.core.robust.odometry.untold import log_slip
 from l1slam_ros.core.robust.pairwise_consistency import (
     Group,
-    asked,
     by_pair_of_parts,
     longest_run,
     spanned,
@@ -78,18 +78,16 @@ def _join_by(growth: Growth, group: Group) -> None:
     growth.solve()
 
 
-def without(growth: Growth, step: int, motion: Motion) -> tuple[Growth | None, float]:
+def without(growth: Growth, step: int) -> Growth | None:
     """
-    Return the state after the rounds that follow if a step is cut, and what it costs, ln of odds.
+    Return the state after the rounds that follow if a step is cut, None: it falls apart.
 
-    None: it falls apart. Where loops of two places or a long run do not join its sides, those do
-    that came in before, else the one that shows a slip best: chosen, its place says nothing.
+    Where loops of two places or a long run do not join its sides, those do that came in before.
     """
     state, span = growth.copy(), growth.given.spanning(step)
     state.cut[step] = True
     state.drops[:] = 0
     kept = state.copy()
-    costs = 0.0
     told = (state.accepted & span).any()
     if told:
         state.accepted[span] = state.given.trusted[span]
@@ -99,32 +97,55 @@ def without(growth: Growth, step: int, motion: Motion) -> tuple[Growth | None, f
     if not join(state, by_runs=True) or state.across()[step]:
         if told:
             kept.solve()
-        if told and not kept.across()[step]:
-            state = kept
-        elif _join_as_usual(state, step, motion):
-            costs = state.given.log_odds_of_place
-        else:
-            return None, 0.0
+        if not told or kept.across()[step]:
+            return None
+        state = kept
     state.accept_more()
     if not (state.accepted & ~growth.accepted).any():
         state.learn_noise_anew()  # it was learnt of the slip, too
-    return state, costs
+    return state
 
 
-def _join_as_usual(state: Growth, step: int, motion: Motion) -> bool:
-    """Join the sides of a step by the loop that shows a slip there rather than lies, or none."""
-    given, part = state.given, state.part
-    cut = np.array([step])
-    rows = state.joining()
-    rows = asked(state, rows[(part[given.low[rows]] == part[given.low[step]])
-                             & (part[given.high[rows]] == part[given.high[step]])
-                             & (given.factors.freedom[rows] == len(motion.mean))])
-    told = slips_told(state, motion, cut, rows)[:, 0]
-    if told.max(initial=-np.inf) < motion.log_density(steps_of(state, cut))[0]:
-        return False
-    best = rows[[np.argmax(told)]]
-    _join_by(state, Group(best, given.place[best]))
-    return not state.across()[step]
+def as_shown(growth: Growth, steps: list[int], loops: list[int]) -> Growth | None:
+    """
+    Return the state after the rounds that follow if steps are cut, None: it falls apart.
+
+    loops : for each step one that shows that it slipped, which joins its sides
+    """
+    state, given = growth.copy(), growth.given
+    state.cut[steps] = True
+    state.drops[:] = 0
+    state.label_parts()
+    for step, loop in zip(steps, loops, strict=True):
+        if not state.across()[step]:
+            span = given.spanning(step)
+            state.accepted[span] = given.trusted[span]
+            state.label_parts()
+        if state.across()[loop]:
+            _join_by(state, Group(np.array([loop]), given.place[[loop]]))
+    join(state, by_runs=True)
+    if (state.across() & state.cut & ~given.gap).any():
+        return None
+    state.accept_more()
+    return state
+
+
+def odds_as_shown(state: Growth, steps: Indices, motion: Motion) -> float:
+    """
+    Return ln of the odds that steps slipped that are cut, if a loop each, else a lie, tells of it.
+
+    As in `shown_slips`, but for the prior; how the robot moved at each is known by all loops.
+    """
+    given, odds = state.given, 0.0
+    manifold = given.graph.manifold
+    claims = claimed_volume(manifold, state.poses)[manifold.TRANSLATION].sum()
+    start = manifold.identity(1)
+    for row in steps[:, None]:
+        moved, spread = _repaired(state, int(row[0]), row, np.zeros(1, np.int64))
+        slip = manifold.local(manifold.retract(start, moved), given.factors.measurement[row])
+        odds += float((motion.log_density(moved, spread) + log_slip(manifold, slip, spread, motion)
+                       - motion.log_density(steps_of(state, row)))[0])
+    return odds + len(steps) * float(claims)
 
 
 def settled(state: Growth, motion: Motion) -> Growth:

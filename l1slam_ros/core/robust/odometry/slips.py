@@ -9,13 +9,15 @@
 """
 Slips of the odometry: steps of which only the loops across can tell.
 
-A slip is suspected where the odds of one are not small (`motion`), or where loops that are left
-out agree; several at once are looked for first (`together`). Then slip and lies are compared: the
-step is cut, the loops across are asked anew (`cuts`), and the rounds go on from there. To the odds
-comes half a gate for each place that is won and that nothing else explains, less one for each that
-is lost. A slip is believed if that makes it likelier than not. Loops do not make a robot jump: the
-slip repaired, it has to move as at some other step, or rather so than as measured. What fits the
-loops that came in without it did not slip: a lie, or another slip, had bent the map.
+A slip is suspected where a loop that is left out shows one: if it is true and the step slipped,
+the robot moved there as elsewhere (`untold`); all that are shown so are tried first, together. Or
+where the odds of one are not small (`motion`). Then slip and lies are compared: the step is cut,
+the loops across are asked anew (`cuts`), and the rounds go on from there. To the odds comes half a
+gate for each place that is won and that nothing else explains, less one for each that is lost; of
+the loop that alone shows a slip, what it shows. A slip is believed if that makes it likelier than
+not. Loops do not make a robot jump: the slip repaired, it has to move as at some other step, or
+rather so than as measured. What fits the loops that came in without it did not slip: a lie, or
+another slip, had bent the map.
 """
 
 from collections.abc import Iterator
@@ -23,23 +25,37 @@ from collections.abc import Iterator
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import component_labels
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.inspection import FEWEST
-from l1slam_ros.core.robust.odometry.cuts import put_back, settled, unusual, without
+from l1slam_ros.core.robust.odometry.cuts import (
+    as_shown,
+    odds_as_shown,
+    put_back,
+    settled,
+    unusual,
+    without,
+)
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
     log_odds_of_slips,
     usual_motion,
 )
-from l1slam_ros.core.robust.odometry.noisier import FAR_NOISIER, with_runs
-from l1slam_ros.core.robust.odometry.together import agreeing, without_some
-from l1slam_ros.core.robust.odometry.untold import LEAST, untold_slip
-from l1slam_ros.core.robust.pairwise_consistency import gain_of, spanned, strongest_group
-from l1slam_ros.core.robust.rounds.evidence import FEWEST_PLACES
+from l1slam_ros.core.robust.odometry.noisier import with_runs
+from l1slam_ros.core.robust.odometry.untold import (
+    LEAST,
+    Shown,
+    prior_of_slip,
+    shown_slips,
+    untold_slip,
+)
+from l1slam_ros.core.robust.pairwise_consistency import gain_of, spanned
 from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 
-# A step that may have slipped, the state without it and others, and what that costs.
+# A step that may have slipped, the state without it and others, and what that costs, ln of odds.
 Attempt = tuple[int, Growth | None, float]
+# A step, the refused loop that shows that it slipped, and ln of the odds.
+Told = tuple[int, int, float]
 # So many steps are tried for each reason.
 _TRIED = 2
 # What is nearly sure: ln of the odds.
@@ -60,12 +76,17 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         return None
     motion = usual_motion(growth)
     odds = log_odds_of_slips(growth, motion)
-    for attempts in (_together(growth, motion), _tried(growth, as_stated, motion)):
+    shown = shown_slips(as_stated, motion)
+    told = _told(as_stated, shown)
+    likely = [one for one in told if one[2] > -SURE]
+    for attempts in (_as_shown(growth, motion, likely), _tried(growth, as_stated, motion),
+                     *(_as_shown(growth, motion, [one])
+                       for one in told[len(likely):len(likely) + _TRIED])):
         if found := _best(growth, as_stated, motion, odds, attempts):
             return found
     found = with_runs(growth)
     if not found:
-        growth.slip_odds |= _odds_in_the_end(growth, as_stated, motion)
+        growth.slip_odds |= _odds_in_the_end(growth, motion, untold_slip(as_stated, shown))
     return found
 
 
@@ -87,9 +108,14 @@ def _best(growth: Growth, as_stated: Growth, motion: Motion, odds: Array,
         usual = not np.isin(steps, unusual(state, motion)).any()
         evidence = _odds_of_cuts(growth, state, motion, odds, usual) - costs
         evidence += gain_of(growth, as_stated, state) if usual else 0.0
+        shown = -np.inf
+        if usual and len(steps) and not (growth.cut & ~state.cut).any():
+            shown = _odds_as_shown(growth, as_stated, state, motion)
+        evidence = max(evidence, shown)
         if not len(steps):
             _suspect(growth, step, float(log_odds_of_slips(state, motion)[step]))
-        elif np.count_nonzero(state.cut != growth.cut) == 1:
+        # What one loop shows is not bent by another slip: then it would show none.
+        elif np.count_nonzero(state.cut != growth.cut) == 1 and not -np.inf < shown < LEAST:
             _suspect(growth, int(steps[0]), evidence)
         if evidence > most and (usual or (odds[steps] > 0).all()):
             found, most = state, evidence
@@ -97,16 +123,53 @@ def _best(growth: Growth, as_stated: Growth, motion: Motion, odds: Array,
     return found
 
 
-def _together(growth: Growth, motion: Motion) -> Iterator[Attempt]:
-    """Yield states without steps that slipped together, see `together`."""
-    agree = agreeing(growth)
-    for noisier in (1.0, FAR_NOISIER):
-        state = without_some(growth, agree, noisier)
-        if not state:  # in the other map they would hardly agree more, and both take long
-            return
-        state = put_back(settled(state, motion), motion)
-        for step in np.flatnonzero(state.cut & ~growth.cut)[:1].tolist():
-            yield step, state, 0.0
+def _told(growth: Growth, shown: Shown) -> list[Told]:
+    """Return the steps that refused loops show to have slipped, the likeliest first."""
+    given = growth.given
+    rows, steps, odds = shown
+    told: list[Told] = []
+    if not len(odds):
+        return told
+    best, most = np.argmax(odds, axis=0), odds.max(axis=0)
+    for k in np.argsort(-most, kind='stable').tolist():
+        step, loop = int(steps[k]), int(rows[best[k]])
+        if most[k] < -given.log_odds_of_place:
+            break
+        # What a loop says of a step holds if no other one that it spans slipped.
+        if not any(given.spanning(step)[other] or given.spanning(one)[loop]
+                   for one, other, _ in told):
+            told.append((step, loop, float(most[k])))
+    return told
+
+
+def _as_shown(growth: Growth, motion: Motion, told: list[Told]) -> Iterator[Attempt]:
+    """Yield states without steps that loops show to have slipped, all of them and each."""
+    tries = [told, *([one] for one in told)] if len(told) > 1 else [told] * len(told)
+    for some in tries:
+        state = as_shown(growth, [step for step, *_ in some], [loop for _, loop, _ in some])
+        if state:
+            # One loop that is hardly likely says nothing but what slipped.
+            costs = growth.given.log_odds_of_place if some[0][2] <= -SURE else 0.0
+            yield some[0][0], put_back(settled(state, motion), motion), costs
+
+
+def _odds_as_shown(growth: Growth, as_stated: Growth, state: Growth, motion: Motion) -> float:
+    """
+    Return ln of the odds of the cuts of a state, where only loops that came in say what slipped.
+
+    Of each step one of these is worth what it shows, be its place known or not; what else is won
+    counts. -inf: loops that were there before say it.
+    """
+    given, steps = growth.given, np.flatnonzero(state.cut & ~growth.cut)
+    before = (growth.accepted | as_stated.accepted) & state.accepted & ~state.cut
+    part = component_labels(given.graph.subset(before))
+    if not (part[given.low[steps]] != part[given.high[steps]]).any():
+        return -np.inf
+    gain = gain_of(growth, as_stated, state)
+    shown = odds_as_shown(state, steps, motion) + len(steps) * prior_of_slip(as_stated)
+    lost = len(np.unique(given.place[growth.accepted & ~state.accepted]))
+    place = given.log_odds_of_place
+    return shown + max(gain - len(steps) * place, -lost * place)
 
 
 def _suspect(growth: Growth, step: int, odds: float) -> None:
@@ -127,9 +190,10 @@ def _odds_of_cuts(growth: Growth, state: Growth, motion: Motion, odds: Array, us
     return own
 
 
-def _odds_in_the_end(growth: Growth, as_stated: Growth, motion: Motion) -> dict[int, float]:
+def _odds_in_the_end(growth: Growth, motion: Motion, untold: dict[int, float]
+                     ) -> dict[int, float]:
     """Return ln of the odds to have slipped of steps that are cut, or of which no loop tells."""
-    last = {step: odds for step, odds in untold_slip(as_stated, motion).items() if odds > LEAST}
+    last = {step: odds for step, odds in untold.items() if odds > LEAST}
     if growth.cut.any():
         # More is known than when it was cut.
         now = log_odds_of_slips(growth, motion)
@@ -140,7 +204,7 @@ def _odds_in_the_end(growth: Growth, as_stated: Growth, motion: Motion) -> dict[
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None = None
            ) -> Iterator[Attempt]:
     """
-    Yield steps that are cut, the state without them, and what that costs, see `without`.
+    Yield steps that are cut, and the state without them.
 
     None: it falls apart. Where the robot, repaired, does not move as elsewhere, a second step
     bends what the loops across the first one say: the likeliest are tried, however unlikely each
@@ -154,28 +218,24 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None
     most = max(SURE, growth.given.log_odds_of_place) if len(left_out) else SURE
     least = most if after is None else SURE if after else np.inf
     for step in _suspected(growth, odds, left_out[:0] if after else left_out, least):
-        state, costs = without(growth, step, motion)
+        state = without(growth, step)
         if not state:
             yield step, None, 0.0
             continue
         state = settled(state, motion)
-        won = gain_of_places(growth, as_stated, state) - costs
-        if costs and after is None and won <= 0:  # as if it had fallen apart
-            yield step, None, 0.0
-        else:
-            yield step, put_back(state, motion), costs
+        yield step, put_back(state, motion), 0.0
         usual = not len(unusual(state, motion))
+        won = gain_of_places(growth, as_stated, state)
         if after is None and (not usual or odds[step] + won <= 0):
-            for _, both, more in _tried(state, state, motion, usual):
-                if both:
-                    yield step, both, costs + more
+            yield from ((step, both, 0.0)
+                        for _, both, _ in _tried(state, state, motion, usual) if both)
 
 
 def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> list[int]:
     """
-    Return the odometry factors that may have slipped: two by their odds, two by groups.
+    Return the odometry factors that may have slipped by their odds, two at most.
 
-    least : how large the odds are against those that are suspected for their own, at most
+    least : how large the odds are against them, at most
     """
     given = growth.given
     tell = growth.accepted & given.is_loop
@@ -185,16 +245,7 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
     told = np.where((across[given.low] > 0) & ~growth.cut, odds, -np.inf)
     order = np.argsort(-told, kind='stable')[:_TRIED]
     suspects: list[int] = order[told[order] > -least].tolist()
-    for _ in range(_TRIED):
-        group = strongest_group(growth, left_out)
-        if len(group.places) < FEWEST_PLACES:
-            break
-        common = common_steps(growth, group.rows)
-        common = common[~growth.cut[common]]
-        if len(common):
-            suspects.append(int(common[np.argmax(odds[common])]))
-        left_out = np.setdiff1d(left_out, group.rows)
-    return list(dict.fromkeys(suspects))
+    return suspects
 
 
 def common_steps(growth: Growth, rows: Indices) -> Indices:

@@ -24,43 +24,73 @@ from l1slam_ros.core.robust.forecast import CONFIDENT
 from l1slam_ros.core.robust.innovation import claimed_volume
 from l1slam_ros.core.robust.odometry.motion import Motion, steps_of, unwhitening
 from l1slam_ros.core.robust.pairwise_consistency import asked, spanned
+from l1slam_ros.core.robust.rounds.evidence import FEWEST_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 
 # ln of odds from which on such a slip is a doubt: a map that is less likely right is doubted.
 LEAST = float(np.log(1 / CONFIDENT - 1))
+# Refused loops (l,), steps (k,), and ln of the odds that each shows each slipped, (l, k).
+Shown = tuple[Indices, Indices, Array]
 # Pairs of a loop and a step that are looked at together.
 _PAIRS = 20_000
 
 
-def untold_slip(growth: Growth, motion: Motion) -> dict[int, float]:
+def untold_slip(growth: Growth, shown: Shown) -> dict[int, float]:
     """
     Return ln of the odds that a step slipped of which no accepted loop tells, by the step.
 
     Of all such steps together, by the likeliest one; {}: there is none, or nothing that is
-    refused tells of it either. The refused loop is true then, else it is a lie and nothing
-    slipped. Of a step z, one of n, and y, what it was if the loop is true,
+    refused tells of it either. shown : see `shown_slips`
+    """
+    given = growth.given
+    _, steps, odds = shown
+    loops = growth.accepted & given.is_loop
+    across = spanned(given.low[loops], given.high[loops], given.graph.n_poses)
+    untold = across[given.low[steps]] == 0
+    if not len(odds) or not untold.any():
+        return {}
+    by_step = np.logaddexp.reduce(odds[:, untold], axis=0)
+    all_of_them = float(np.logaddexp.reduce(by_step))
+    return {int(steps[untold][np.argmax(by_step)]): all_of_them} if np.isfinite(
+        all_of_them) else {}
+
+
+def shown_slips(growth: Growth, motion: Motion) -> Shown:
+    """
+    Return refused loops (l,), steps (k,), and ln of the odds that each shows each slipped, (l, k).
+
+    Of steps of which few places tell; what spans another step that is cut, tells of none. The
+    refused loop is true then, else it is a lie and nothing slipped. Of a step z, one of n, and y,
+    what it was if the loop is true,
 
         p(y as motion) p_slip(z | y) V true / (n p(z as motion) refused)
 
-    summed over the refused loops, with V as much as lies claim, true how many places are accepted
-    and refused how many loops are. A slip turns by anything and moves by a Cauchy distribution, as
-    wide as steps are long and as y is unsure.
+    with V as much as lies claim, true how many places are accepted and refused how many loops are.
+    A slip turns by anything and moves by a Cauchy distribution, as wide as steps are long and as y
+    is unsure.
     """
-    given = growth.given
-    loops = growth.accepted & given.is_loop
+    given, n = growth.given, growth.given.graph.n_poses
+    loops = np.flatnonzero(growth.accepted & given.is_loop)
+    loops = loops[np.unique(given.place[loops], return_index=True)[1]]
     rows = growth.undecided()
     rows = asked(growth, rows[given.factors.freedom[rows] == len(motion.mean)])
-    across = spanned(given.low[loops], given.high[loops], given.graph.n_poses)
+    cuts = np.append(0, np.cumsum(spanned(given.low[growth.cut], given.high[growth.cut], n)))
+    tell = loops[cuts[given.low[loops]] == cuts[given.high[loops]]]
+    across = spanned(given.low[tell], given.high[tell], n)
     steps = np.flatnonzero(~given.is_loop & ~growth.cut)
-    count = len(steps)
-    steps = steps[across[given.low[steps]] == 0]
+    steps = steps[across[given.low[steps]] < FEWEST_PLACES]
     if not len(rows) or not len(steps):
-        return {}
-    odds = np.logaddexp.reduce(slips_told(growth, motion, steps, rows), axis=0)
-    true, refused = len(np.unique(given.place[loops])) + 1, len(rows) + 1
-    odds += np.log(true / refused / count) - motion.log_density(steps_of(growth, steps))
-    all_of_them = float(np.logaddexp.reduce(odds))
-    return {int(steps[np.argmax(odds)]): all_of_them} if np.isfinite(all_of_them) else {}
+        return rows, steps, np.zeros((0, len(steps)))
+    odds = slips_told(growth, motion, steps, rows) - motion.log_density(steps_of(growth, steps))
+    return rows, steps, odds + prior_of_slip(growth)
+
+
+def prior_of_slip(growth: Growth) -> float:
+    """Return ln of the odds that a refused loop is true and a step slipped, see above."""
+    given = growth.given
+    true = len(np.unique(given.place[growth.accepted & given.is_loop])) + 1
+    return float(np.log(true / (len(growth.undecided()) + 1) / np.count_nonzero(
+        ~given.is_loop & ~growth.cut)))
 
 
 def slips_told(growth: Growth, motion: Motion, steps: Indices, rows: Indices) -> Array:
@@ -104,10 +134,10 @@ def _log_density(growth: Growth, motion: Motion, steps: Indices, rows: Indices,
     J = manifold.local_jacobian(start, y)
     moved = motion.log_density(manifold.local(start, y), J @ spread @ J.transpose(0, 2, 1))
     slip = manifold.local(y, given.factors.measurement[steps])
-    return moved + _log_slip(manifold, slip, spread, motion)
+    return moved + log_slip(manifold, slip, spread, motion)
 
 
-def _log_slip(manifold: Manifold, slip: Array, spread: Array, motion: Motion) -> Array:
+def log_slip(manifold: Manifold, slip: Array, spread: Array, motion: Motion) -> Array:
     """Return the log density of slips, tangents (k, d), that are known to (k, d, d)."""
     part = manifold.TRANSLATION
     square = (slip[:, part] ** 2).sum(axis=1)
