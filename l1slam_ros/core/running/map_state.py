@@ -198,8 +198,8 @@ class MapState(NamedTuple):
         Return the state after a judgement of so many loops, of which poses (n, p) is the L2 map.
 
         A judgement that accepts other factors than the map uses, or corrects or weighs them
-        otherwise, is pending until a map is made of it; anew : it is from the graph alone; held : such a one is
-        not taken, but made once more when the robot stands
+        otherwise, is pending until a map is made of it; anew : it is from the graph alone; held :
+        such a one is not taken, but made once more when the robot stands
         """
         accepted = self.table.accepted[:len(judgement.accepted)]
         same = (judgement.drift == self.of_all.drift
