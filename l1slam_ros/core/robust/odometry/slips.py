@@ -195,10 +195,21 @@ def _odds_in_the_end(growth: Growth, motion: Motion, untold: dict[int, float]
     """Return ln of the odds to have slipped of steps that are cut, or of which no loop tells."""
     last = {step: odds for step, odds in untold.items() if odds > LEAST}
     if growth.cut.any():
-        # More is known than when it was cut.
+        # More is known than when it was cut, unless that is what a lie would tell.
         now = log_odds_of_slips(growth, motion)
-        last |= {step: float(now[step]) for step in growth.slip_odds if growth.cut[step]}
+        last |= {step: float(now[step]) for step in growth.slip_odds
+                 if growth.cut[step] and not _is_lie_likelier(growth, step, motion)}
     return {step: max(odds, growth.slip_odds.get(step, odds)) for step, odds in last.items()}
+
+
+def _is_lie_likelier(growth: Growth, step: int, motion: Motion) -> bool:
+    """Return whether the loops of one place alone tell of a cut, and likelier lie than not."""
+    given = growth.given
+    loops = np.flatnonzero(growth.accepted & given.is_loop & given.spanning(step))
+    if len(np.unique(given.place[loops])) > 1:
+        return False
+    shown = odds_as_shown(growth, np.array([step]), motion) + prior_of_slip(growth)
+    return shown < 0
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None = None
