@@ -70,6 +70,7 @@ from l1slam_ros.core.robust.innovation import (
     covariances,
     spread_of,
 )
+from l1slam_ros.core.robust.inspection import OFF_SCALE
 from l1slam_ros.core.robust.judgement import (
     NORM,
     UNSOLVED,
@@ -86,7 +87,7 @@ from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.robust.odometry.noisier import with_runs
 from l1slam_ros.core.robust.odometry.slips import without_slip
 from l1slam_ros.core.robust.reasons import doubts
-from l1slam_ros.core.robust.rounds.growth import NOISIER, Growth
+from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 from l1slam_ros.core.solvers.nonlinear import Solution
@@ -154,7 +155,8 @@ class _Repair:
     def _straightened(self, found: Growth, as_stated: Growth) -> Growth | None:
         """Return the state without a drift that explains the loops, or was taken for noise."""
         best = stated = Straight(0.0, found, as_stated)
-        asked = len(as_stated.undecided()) or as_stated.noise.variance[0] > NOISIER
+        # Odometry that is so much noisier than it states may drift.
+        asked = len(as_stated.undecided()) or as_stated.noise.variance[0] > OFF_SCALE
         drifts = likely_drifts(self._graph).tolist() if asked else []
         if drifts:
             some = [stated, *(end for drift in drifts for end in self._without(drift))]

@@ -119,8 +119,8 @@ def test_a_run_of_loops_that_a_cut_lets_in_counts_though_their_place_was_known(
     assert graph.between.i[judgement.slips].tolist() == steps and not judgement.doubts
 
 
-@pytest.mark.parametrize('stated, turn, named', [(1.0, 0.14, [STEP]), (10.0, 0.14, []),
-                                                 (10.0, 0.2, [STEP])])
+@pytest.mark.parametrize('stated, turn, named', [(1.0, 0.14, [STEP]), (4.0, 0.056, []),
+                                                 (4.0, 0.2, [STEP]), (10.0, 0.14, [STEP])])
 def test_what_is_within_the_noise_as_stated_is_no_slip(bad, stated, turn, named):
     """3 sigmas are none, though loops that know better speak against it; 40 real ones are."""
     graph = retold(slipped(bad.graph, STEP, (0.0, 0.0, turn)), times=stated)

@@ -193,13 +193,14 @@ def _odds_of_cuts(growth: Growth, state: Growth, motion: Motion, odds: Array, us
 def _odds_in_the_end(growth: Growth, motion: Motion, untold: dict[int, float]
                      ) -> dict[int, float]:
     """Return ln of the odds to have slipped of steps that are cut, or of which no loop tells."""
-    last = {step: odds for step, odds in untold.items() if odds > LEAST}
+    last = {step: max(odds, growth.slip_odds.get(step, odds))
+            for step, odds in untold.items() if odds > LEAST}
     if growth.cut.any():
         # More is known than when it was cut, unless that is what a lie would tell.
         now = log_odds_of_slips(growth, motion)
         last |= {step: float(now[step]) for step in growth.slip_odds
                  if growth.cut[step] and not _is_lie_likelier(growth, step, motion)}
-    return {step: max(odds, growth.slip_odds.get(step, odds)) for step, odds in last.items()}
+    return last
 
 
 def _is_lie_likelier(growth: Growth, step: int, motion: Motion) -> bool:

@@ -49,10 +49,6 @@ _CHANCES = 2
 # The tail of the noise ends no further off than so many times what nearly all stay below, in
 # squares.
 _TAIL = 2.0
-# Noise that is so many times the variance that was found is measured anew before any loop is
-# dropped for it, by the median of factors that others check; so many times what is stated, the
-# odometry may drift.
-NOISIER = OFF_SCALE
 # So often noise is learnt anew of other factors: each time half of what it was before may stay.
 _LEARNT_ANEW = 8
 # While driving so many of the last absolute factors are looked at, with their neighbours.
@@ -272,7 +268,7 @@ class Growth:
             self._learn_noise(rows)
 
     def _is_noisier(self, rows: Indices) -> bool:
-        """Raise the variance where half of the factors say that it is far too small."""
+        """Raise the variance where half of the factors, checked by others, say it is too small."""
         loops = self.given.is_loop[rows]
         if self.noise.is_known(self.accepted) or self.given.may_err_as_one(rows[loops]):
             return False
@@ -283,7 +279,7 @@ class Growth:
                           if (known & kind).any() else 0.0 for kind in (~loops, loops)])
         k = self.given.graph.manifold.TANGENT_SIZE
         scale *= k / chi2_quantile(0.5, np.array([k]))
-        noisier = scale > NOISIER
+        noisier = scale > OFF_SCALE
         self.noise = self.noise.found(np.where(noisier, scale, 1.0) * self.noise.variance)
         return bool(noisier.any())
 
