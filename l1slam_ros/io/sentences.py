@@ -45,6 +45,9 @@ _SLIP = ('the odometry slipped from {pair}: this step is {sigmas:.1f} sigmas off
 # The odometry in the written map is not as measured: whoever uses that file has to know.
 _DRIFT = ('the odometry drifts by {drift:+.3g} rad per metre, as the loops agree; the map uses '
           'odometry that is corrected for that')
+# What a file states as the identity nobody measured, and a radian is no metre.
+_IDENTITY = ('the information of the {kind} is the identity: the map is weighed by the noise that '
+             'was estimated, {metres:.2g} m and {degrees:.2g} degrees')
 # Estimated sigmas this many times the stated ones are reported; smaller errors are common.
 _NOISY = 2.0
 # Of odometry and of loops, in the order of `Judgement.variance`.
@@ -91,6 +94,7 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     pairs = record.ids[factors.pairs]
     if judgement.drift:
         yield _DRIFT.format(drift=judgement.drift)
+    yield from _identity_sentences(record.graph.manifold, judgement)
     for row in judgement.slips.tolist():
         yield _SLIP.format(pair=_named(pairs[row]), sigmas=judgement.sigmas[row])
     refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect & ~factors.struck)
@@ -110,6 +114,16 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
             yield sentence.format(times=times)
     if not judgement.is_noise_stated:
         yield _TOGETHER
+
+
+def _identity_sentences(manifold: Manifold, judgement: Judgement) -> Iterator[str]:
+    """Yield the noise that was found of what states the identity."""
+    found = np.sqrt(judgement.meant * judgement.variance_meant[:, None])
+    for kind, sigmas in zip(('odometry', 'loops'), found, strict=True):
+        if np.ptp(sigmas):
+            yield _IDENTITY.format(
+                kind=kind, metres=sigmas[manifold.TRANSLATION][0],
+                degrees=math.degrees(sigmas[manifold.ROTATION][0]))
 
 
 def known_false_sentence(record: GraphRecord, judgement: Judgement | None) -> Iterator[str]:

@@ -135,3 +135,14 @@ def test_what_a_solve_finds_of_the_noise_is_told():
                                          found.judgement))
     times = re.search(re.escape(NOISY_ODOMETRY).replace(r'\{\}', r'(\d+\.\d)'), said)
     assert 3 < float(times[1]) < 6
+
+
+def test_what_states_the_identity_is_told_with_the_noise_that_was_found(record):
+    meant = np.array([[4.0, 4.0, 0.25], [1.0, 1.0, 1.0]])
+    said = list(judgement_sentences(record, replace(judgement(), meant=meant)))
+    # The odometry's variance of 1 is of the geometric mean of its three numbers.
+    mean = (4.0 * 4.0 * 0.25) ** (1 / 3)
+    metres, degrees = 2 / np.sqrt(mean), np.degrees(0.5 / np.sqrt(mean))
+    assert said[0] == ('the information of the odometry is the identity: the map is weighed by '
+                       f'the noise that was estimated, {metres:.2g} m and {degrees:.2g} degrees')
+    assert not [sentence for sentence in said[1:] if 'identity' in sentence]
