@@ -128,8 +128,8 @@ def _on_gaps(record: GraphRecord) -> Iterator[str]:
 
 
 def _on_repetitions(record: GraphRecord) -> Iterator[str]:
-    rows = np.arange(len(record.graph.between))
-    repeated = np.flatnonzero(first_told(record.graph, rows) != rows)
+    first = first_told(record.graph, inspection.parallel_factors(record.graph))
+    repeated = np.flatnonzero(first != np.arange(len(first)))
     if len(repeated):
         yield (f'{_listed("edge", _edges(record, repeated), len(repeated))}: given before with '
                'the same measurement, so counted twice')

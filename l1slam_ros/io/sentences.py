@@ -14,7 +14,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.graph.factor_graph import BetweenFactors
+from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
+from l1slam_ros.core.robust.as_measured import states_identity
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
     FAILED,
@@ -94,7 +95,7 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     pairs = record.ids[factors.pairs]
     if judgement.drift:
         yield _DRIFT.format(drift=judgement.drift)
-    yield from _identity_sentences(record.graph.manifold, judgement)
+    yield from _identity_sentences(record.graph, judgement)
     for row in judgement.slips.tolist():
         yield _SLIP.format(pair=_named(pairs[row]), sigmas=judgement.sigmas[row])
     refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect & ~factors.struck)
@@ -116,11 +117,15 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
         yield _TOGETHER
 
 
-def _identity_sentences(manifold: Manifold, judgement: Judgement) -> Iterator[str]:
+def _identity_sentences(graph: FactorGraph, judgement: Judgement) -> Iterator[str]:
     """Yield the noise that was found of what states the identity."""
+    if (judgement.meant == 1).all():
+        return
+    manifold = graph.manifold
     found = np.sqrt(judgement.meant * judgement.variance_meant[:, None])
-    for kind, sigmas in zip(('odometry', 'loops'), found, strict=True):
-        if np.ptp(sigmas):
+    for kind, stated, sigmas in zip(
+            ('odometry', 'loops'), states_identity(graph), found, strict=True):
+        if stated and np.ptp(sigmas):
             yield _IDENTITY.format(
                 kind=kind, metres=sigmas[manifold.TRANSLATION][0],
                 degrees=math.degrees(sigmas[manifold.ROTATION][0]))

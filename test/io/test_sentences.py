@@ -146,3 +146,14 @@ def test_what_states_the_identity_is_told_with_the_noise_that_was_found(record):
     assert said[0] == ('the information of the odometry is the identity: the map is weighed by '
                        f'the noise that was estimated, {metres:.2g} m and {degrees:.2g} degrees')
     assert not [sentence for sentence in said[1:] if 'identity' in sentence]
+
+
+def test_noise_that_was_found_of_stated_loops_is_no_identity(record):
+    """Where odometry alone states the identity, moves and turns of loops are found apart, too."""
+    loops = ~record.graph.between.is_odometry
+    stated = record.graph.subset(np.arange(len(loops)), np.where(loops, 0.5, 1.0))
+    meant = np.tile([4.0, 4.0, 0.25], (2, 1))
+    said = list(judgement_sentences(
+        GraphRecord(stated, None, record.ids), replace(judgement(), meant=meant)))
+    assert [sentence.split(' is ')[0] for sentence in said if 'identity' in sentence] == [
+        'the information of the odometry']

@@ -98,8 +98,7 @@ def _plans(record: GraphRecord, judgement: Judgement, asked: SolveOptions) -> It
             yield _Plan(f'{loops} vouched for', number, _told(graph, rows, True), asked)
         elif doubt.kind == WEAK and len(rows) <= graph.n_poses:
             # Of many more a graph fills in, and nobody would take them all for true.
-            yield _Plan('every loop believed', number, straightened(graph, judgement.drift),
-                        believing)
+            yield _Plan('every loop believed', number, judgement.corrected(graph), believing)
         elif doubt.kind == SLIP:
             yield from _of_step(record, judgement, doubt, number, believing)
         elif doubt.kind == DRIFTS:
@@ -128,5 +127,5 @@ def _of_step(record: GraphRecord, judgement: Judgement, doubt: Doubt, number: in
         step = f'{record.ids[doubt.first]} - {record.ids[doubt.last]}'
         word = 'with' if believed[rows[0]] else 'without'
         yield _Plan(f'{word} the step {step}', number,
-                    straightened(judgement.as_meant(record.graph), judgement.drift).subset(
+                    judgement.corrected(record.graph).subset(
                         believed, judgement.noise[believed]), believing)

@@ -21,9 +21,10 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.inspection import FEWEST
-from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.robust.judgement import Judgement, weighed
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.places import first_told
 from l1slam_ros.core.robust.rounds.growth import Growth
@@ -70,16 +71,13 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
     By what is stated there, far too many loops that are off fit by chance. Where it states the
     identity, a radian is no metre either: what each is worth is found, and weighs the map.
     """
-    factors, meant = graph.between, np.ones((2, graph.manifold.TANGENT_SIZE))
-    kind = (~factors.is_odometry).astype(np.int64)
-    for number, turns in enumerate(meant[:, graph.manifold.ROTATION]):
-        roots = factors.sqrt_information[kind == number]
-        if len(roots) and np.allclose(roots, np.eye(meant.shape[1])):
-            turns[:] = 1.0 if factors.is_absolute.any() else _TURN
-    rows = np.arange(len(factors))
-    first = graph if (meant == 1).all() else graph.subset(rows, meant[kind])
+    meant = np.ones((2, graph.manifold.TANGENT_SIZE))
+    has_absolute = graph.between.is_absolute.any()
+    if not has_absolute:
+        meant[states_identity(graph), graph.manifold.ROTATION] = _TURN
+    first = weighed(graph, meant)
     judgement, poses = judge(first, report, check, known)
-    if factors.is_absolute.any() or first is graph and (
+    if has_absolute or first is graph and (
             judgement.variance[0] > _OVERSTATED or judgement.accepted.all()):
         return judgement, poses
     try:
@@ -87,10 +85,18 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
                   else _by_number(first, judgement, poses))
     except FAILURES as error:
         return judgement.broken_off(graph, error), poses
-    judgement, poses = judge(graph.subset(rows, meant[kind]), report, check, None)
+    judgement, poses = judge(weighed(graph, meant), report, check, None)
     # What odometry states stays as large, so that the next of it is worth as much.
     times = np.exp(np.log(meant).mean(axis=1))
     return replace(judgement, variance=judgement.variance * times, meant=meant / times[0]), poses
+
+
+def states_identity(graph: FactorGraph) -> Mask:
+    """Return whether the information of all odometry is the identity, and of all loops, (2,)."""
+    factors = graph.between
+    kinds = factors.is_odometry, ~factors.is_odometry
+    return np.array([bool(kind.any()) and np.allclose(
+        factors.sqrt_information[kind], np.eye(graph.manifold.TANGENT_SIZE)) for kind in kinds])
 
 
 def _by_number(graph: FactorGraph, judgement: Judgement, poses: Array) -> Array:

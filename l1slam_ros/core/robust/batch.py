@@ -333,7 +333,7 @@ def judge(
     check : called before long steps, raises where the work shall stop
 
     """
-    first = Growth(straightened(known.as_meant(graph), known.drift), check)
+    first = Growth(known.corrected(graph), check)
     try:
         first.resume(poses, known.accepted, known.variance_meant)
         *_, growth = rounds(first)

@@ -29,6 +29,7 @@ from l1slam_ros.core.robust.forecast import (
     terms_of,
     unsureness,
 )
+from l1slam_ros.core.robust.gating import probability
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.pairwise_consistency import RUN
 from l1slam_ros.core.robust.places import err_together
@@ -168,15 +169,11 @@ class Judgement:
 
     def believed(self, graph: FactorGraph) -> FactorGraph:
         """Return the accepted factors of a graph, as noisy as they are."""
-        straight = straightened(self.as_meant(graph), self.drift)
-        return straight.subset(self.accepted, self.noise[self.accepted])
+        return self.corrected(graph).subset(self.accepted, self.noise[self.accepted])
 
-    def as_meant(self, graph: FactorGraph) -> FactorGraph:
-        """Return a graph with the noise that was meant."""
-        if (self.meant == 1).all():
-            return graph
-        is_loop = ~graph.between.is_odometry
-        return graph.subset(np.arange(len(is_loop)), self.meant[is_loop.astype(np.int64)])
+    def corrected(self, graph: FactorGraph) -> FactorGraph:
+        """Return a graph with the noise that was meant, and odometry without its drift."""
+        return straightened(weighed(graph, self.meant), self.drift)
 
     def found_variance(self, graph: FactorGraph) -> Array:
         """Return the variance that was found of these, in units of what they then state, (k,)."""
@@ -233,6 +230,14 @@ def listed(pairs: Indices) -> tuple[tuple[int, int], ...]:
     return tuple((i, j) for i, j in pairs.tolist())
 
 
+def weighed(graph: FactorGraph, variance: Array) -> FactorGraph:
+    """Return a graph with so many times the variance: (2, k), of odometry and of loops."""
+    if (variance == 1).all():
+        return graph
+    is_loop = ~graph.between.is_odometry
+    return graph.subset(np.arange(len(is_loop)), variance[is_loop.astype(np.int64)])
+
+
 def so_far(growth: Growth, drift: float = 0.0) -> Judgement:
     """Return what a state believes, to fall back on; the loops that it left out are suspect."""
     given = growth.given
@@ -260,7 +265,7 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float =
     size = given.size
     loops = given.is_loop[:size]
     unsure = unsureness(growth)
-    chance = float(1 / (1 + np.exp(-odds)))
+    chance = float(probability(np.array(odds)))
     if not drift and np.isfinite(odds) and chance >= CONFIDENT:
         reasons = tuple(doubt for doubt in reasons if doubt.kind != DRIFTS)
     kinds = {doubt.kind for doubt in reasons}

@@ -34,7 +34,7 @@ from l1slam_ros.core.robust.innovation import (
     innovations,
     sample_posterior,
 )
-from l1slam_ros.core.robust.inspection import FEWEST, OFF_SCALE
+from l1slam_ros.core.robust.inspection import FEWEST, OFF_SCALE, parallel_factors
 from l1slam_ros.core.robust.places import beside_refused, first_told
 from l1slam_ros.core.robust.rounds.evidence import evidence_of
 from l1slam_ros.core.robust.rounds.noise import Noise
@@ -92,7 +92,8 @@ class Growth:
         self._tie_to_world()
         self.solve()
         rows = self.undecided()
-        first = first_told(self.given.graph, np.arange(len(self.given.factors)))
+        graph = self.given.graph
+        first = first_told(graph, parallel_factors(graph))
         # Odometry that stands there twice fits itself, whatever the noise.
         rows = rows[~self.given.factors.is_absolute[rows] & (first[rows] == rows)]
         # Else the noise that is learnt of them would fit their mistake.
