@@ -57,6 +57,22 @@ def test_the_last_stamp_that_there_is_has_a_transform_too(bench):
     b.until(lambda: b.received['map_to_odom'], 'a transform that is no later')
 
 
+def test_two_publishers_of_odometry_are_told_of(bench, capfd):
+    """Of a filter and a driver on one topic, say; from the first message on nothing breaks off."""
+    b = bench()
+    other = b.peer.create_publisher(Odometry, '/odom', 100)
+    b.until(lambda: b.backend.count_publishers('/odom') == 2 and other.get_subscription_count(),
+            'both are heard')
+    for k in range(6):
+        b.drive(2 * k, 2 * k + 1)
+        other.publish(odometry((2 * k + 2) * 10**9, 5.0))
+        b.until(lambda n=2 * k + 2: b.backend._inputs.traffic['odom'].received == n, 'it is used')
+    told = [line for line in capfd.readouterr().err.splitlines() if 'WARN' in line]
+    assert len(told) == 1 and told[0].endswith(
+        'messages of several publishers come by turns on odom, and the map takes them for one '
+        'motion; expected one publisher')
+
+
 def test_strays_do_not_stop_the_map(bench, capfd):
     """A first message of another robot, a stamp of tomorrow, a teleport, loops five times."""
     b = bench(**NO_DOUBT)

@@ -64,3 +64,17 @@ def test_numbers_that_begin_anew_are_of_another_publisher():
         traffic.note({'publication_sequence_number': number})
         found.append(traffic.other_source)
     assert found == [False, False, False, True, False, False, False]
+
+
+@pytest.mark.parametrize('numbers, mixed', [
+    ([1, 2, 5, 6], False),
+    ([7, 8, 1, 2, 5], False),  # a publisher that began anew
+    ([500, 501, 1, 2, 3], False),  # another one took over
+    ([1, 501, 2], True),
+    ([1, 501, 2, 502, 3], True),
+])
+def test_messages_of_two_publishers_that_come_by_turns_are_told(numbers, mixed):
+    traffic = Traffic(lambda: 2)
+    for number in numbers:
+        traffic.note({'publication_sequence_number': number})
+    assert traffic.mixed == mixed

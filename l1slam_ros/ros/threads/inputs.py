@@ -121,7 +121,12 @@ class Inputs:
                 once=True)
         if robot.prefix:
             sample = replace(sample, frame=self._own(robot, sample.frame))
-        if self.traffic[f'{robot.prefix}odom'].other_source:
+        traffic = self.traffic[f'{robot.prefix}odom']
+        if traffic.mixed:
+            self._node.get_logger().warning(
+                f'messages of several publishers come by turns on {robot.prefix}odom, and the map '
+                'takes them for one motion; expected one publisher', once=True)
+        if traffic.other_source:
             sample = replace(sample, other_source=True)
         if self._backend.add_odometry(sample, robot.number):
             self._unanswered.add(robot)

@@ -69,13 +69,14 @@ class Traffic:
     last : what `values` returned last
     other_source : whether the numbers began anew with the last one: of another publisher, or of
         one that was restarted
+    mixed : whether messages of several publishers came by turns
 
     """
 
     def __init__(self, publishers: Callable[[], int], unheard: Callable[[], str] = str):
         self.received = self.lost = 0
         self.last: dict[str, str] = {}
-        self.other_source = False
+        self.other_source = self.mixed = False
         self.publishers, self.unheard = publishers, unheard
         # The last number of each publisher, of who spoke last in front.
         self._numbers: list[int] = []
@@ -97,6 +98,7 @@ class Traffic:
             before = []
         if before:
             nearest = max(before)
+            self.mixed |= nearest != numbers[0]
             numbers.remove(nearest)
             self.lost += number - nearest - 1
         else:
