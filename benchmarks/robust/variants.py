@@ -19,7 +19,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from robust.places import Error, Place
+from robust.places import Error, Place, error_by_time
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
@@ -98,9 +98,11 @@ def _every(place: Place, k: int) -> Place:
 
 
 def _unknown(place: Place) -> Place:
-    """State the identity as information of each factor."""
+    """State the identity as information of each factor; the map to find is that of its own."""
     factors, roots = place.graph.between, place.graph.between.sqrt_information
-    return _told(place, np.arange(place.graph.n_poses), np.arange(len(factors)), factors.i,
+    error = place.truth_error or error_by_time(
+        place.graph.manifold.positions(place.best))
+    return _told(replace(place, truth_error=error), np.arange(place.graph.n_poses), np.arange(len(factors)), factors.i,
                  factors.j, factors.measurement,
                  np.zeros_like(roots) + np.eye(roots.shape[1]))
 

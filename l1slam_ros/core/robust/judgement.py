@@ -80,7 +80,8 @@ class Judgement:
 
     accepted, suspect : (m,) bool, suspect is a loop that fits but could as well be chance, a loop
     that is neither is rejected; sigmas : (m,) how far off each factor is, in units of its noise,
-    as stated or larger if it was found so: the length of the residual, and where it is not
+    as stated or larger if it was found so, less than stated where that is far too much, see
+    `as_measured`: the length of the residual, and where it is not
     accepted, of that over the uncertainty of the map, NaN before a loop was looked at; variance :
     (2,) of odometry and of loops as it was found, in units of what they state; noise : (m,) that
     of each in a map, in the same units; slips : (k,) the odometry factors that slipped, not

@@ -127,9 +127,8 @@ def gain_of(growth: Growth, as_stated: Growth, cut: Growth) -> float:
     before, after = growth.accepted & is_loop, cut.accepted & is_loop
     more = np.flatnonzero(
         after & ~before & ~as_stated.accepted & np.isin(place, place[before]))
-    less = np.flatnonzero(before & ~after & np.isin(place, place[after]))
-    won = len(runs(cut, more)) - len(runs(growth, less))
-    return gain_of_places(growth, as_stated, cut) + growth.given.log_odds_of_place * won
+    return gain_of_places(growth, as_stated, cut) + growth.given.log_odds_of_place * len(
+        runs(cut, more))
 
 
 def agree_at_a_place(growth: Growth, rows: Indices) -> Indices:

@@ -344,4 +344,6 @@ def gain_of_places(growth: Growth, as_stated: Growth, cut: Growth) -> float:
     before, explained, after = (np.unique(place[state.accepted & is_loop])
                                 for state in (growth, as_stated, cut))
     won = len(np.setdiff1d(after, np.union1d(before, explained)))
-    return growth.given.log_odds_of_place * (won - len(np.setdiff1d(before, after)))
+    # Of a place that is long, too, what is lost had to be a mistake.
+    lost = len(np.unique(place[growth.accepted & ~cut.accepted & is_loop]))
+    return growth.given.log_odds_of_place * (won - lost)
