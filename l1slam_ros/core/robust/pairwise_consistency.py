@@ -117,16 +117,16 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
 
 def gain_of(growth: Growth, as_stated: Growth, cut: Growth) -> float:
     """
-    Return what places and runs say that are won and lost by a cut, ln of odds.
+    Return what places and runs say that a cut wins, and places that lose loops, ln of odds.
 
     A robot that goes the same way again and again sees one place all along: that is won before,
     however many of its loops are refused. So a run of these counts as a place does.
     """
     is_loop = growth.given.is_loop
     place = growth.given.place
-    before, after = growth.accepted & is_loop, cut.accepted & is_loop
-    more = np.flatnonzero(
-        after & ~before & ~as_stated.accepted & np.isin(place, place[before]))
+    before = growth.accepted & is_loop
+    more = np.flatnonzero(is_loop & cut.accepted & ~before & ~as_stated.accepted
+                          & np.isin(place, place[before]))
     return gain_of_places(growth, as_stated, cut) + growth.given.log_odds_of_place * len(
         runs(cut, more))
 
