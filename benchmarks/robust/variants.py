@@ -100,10 +100,9 @@ def _every(place: Place, k: int) -> Place:
 def _unknown(place: Place) -> Place:
     """State the identity as information of each factor; the map to find is that of its own."""
     factors, roots = place.graph.between, place.graph.between.sqrt_information
-    error = place.truth_error or error_by_time(
-        place.graph.manifold.positions(place.best))
-    return _told(replace(place, truth_error=error), np.arange(place.graph.n_poses), np.arange(len(factors)), factors.i,
-                 factors.j, factors.measurement,
+    error = place.truth_error or error_by_time(place.graph.manifold.positions(place.best))
+    return _told(replace(place, truth_error=error), np.arange(place.graph.n_poses),
+                 np.arange(len(factors)), factors.i, factors.j, factors.measurement,
                  np.zeros_like(roots) + np.eye(roots.shape[1]))
 
 
