@@ -31,7 +31,7 @@ from l1slam_ros.core.robust.rounds.growth import Growth
 
 # Noise of odometry in units of what it states, in variance: with less nobody meant that, and it is
 # taken for that much. For what was found, loops with more than normal errors would be lost.
-_OVERSTATED = 0.05
+_OVERSTATED = 0.1
 # [rad^2/m^2] Where a file says of a radian what it says of a metre, its variance is taken for so
 # many times that of a metre until it was found: a tenth to a hundredth is usual.
 _TURN = 1 / 30

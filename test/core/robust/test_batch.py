@@ -67,8 +67,8 @@ def test_noise_overstated_alike_is_no_reason_to_doubt_what_does_not_fit():
     found, again = robust_solve(graph.subset(every, np.full(len(every), 1e4)))
     assert (found.accepted == once.accepted).all() and not found.suspect.any()
     np.testing.assert_allclose(found.variance * 1e4, once.variance, rtol=0.01)
-    # Its noise is taken for 20 times the variance that was found.
-    np.testing.assert_allclose(found.sigmas[found.accepted] * 20**0.5,
+    # Its noise is taken for ten times the variance that was found.
+    np.testing.assert_allclose(found.sigmas[found.accepted] * 10**0.5,
                                once.sigmas[found.accepted], rtol=0.1, atol=1e-9)
     assert not found.doubts and position_error(again, poses) < 1e-3
 
