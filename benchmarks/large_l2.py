@@ -19,51 +19,54 @@ import argparse
 import multiprocessing
 import resource
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import peer_environment
 
-if __name__ == '__main__':
-    peer_environment.enter()
+if TYPE_CHECKING:
+    from solvers.cases import Case
+    from solvers.graph_solvers import GraphSolver
 
-import numpy as np
-from solvers import ours
-from solvers.cases import Case
-from solvers.graph_peers import gauss_newton_by
-from solvers.graph_solvers import GraphSolver
-
-from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.solvers.block_cholesky import cholesky_of
-from l1slam_ros.core.solvers.optimality import l2_cost
-from l1slam_ros.core.solvers.seed import first_poses
-from l1slam_ros.io.compilation import STEPS, make_ready
-from l1slam_ros.io.graphs.graph_file import read_graph_file
-
-_SOLVERS = {'ours': ours.L2, 'gtsam, METIS': gauss_newton_by('METIS'),
-            'gtsam, COLAMD': gauss_newton_by('COLAMD')}
+    from l1slam_ros.core.geometry.manifold import Array
 
 
 def main() -> None:
     """Measure, and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('graph', type=Path)
-    record = read_graph_file(parser.parse_args().graph)
+    file = parser.parse_args().graph
+    peer_environment.enter()
+    from solvers import ours
+    from solvers.cases import Case
+    from solvers.graph_peers import gauss_newton_by
+
+    from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+    from l1slam_ros.core.solvers.seed import first_poses
+    from l1slam_ros.io.compilation import STEPS, make_ready
+    from l1slam_ros.io.graphs.graph_file import read_graph_file
+
     for step in STEPS:
         make_ready(step)
+    record = read_graph_file(file)
     case = Case('large', record.graph, record.poses)
     poses = first_poses(case.graph, cholesky_of(case.graph))
-    for name, solver in _SOLVERS.items():
+    for solver in ours.L2, gauss_newton_by('METIS'), gauss_newton_by('COLAMD'):
         # What it takes is its own, but for the graph and these poses.
         process = multiprocessing.get_context('fork').Process(
-            target=_measure, args=(name, solver, case, poses))
+            target=_measure, args=(solver, case, poses))
         process.start()
         process.join()
 
 
-def _measure(name: str, solver: GraphSolver, case: Case, poses: np.ndarray) -> None:
+def _measure(solver: 'GraphSolver', case: 'Case', poses: 'Array') -> None:
+    from l1slam_ros.core.graph.linear_system import whitened_residual
+    from l1slam_ros.core.solvers.optimality import l2_cost
+
     answer = solver.prepare(case, poses)()
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     chi2 = l2_cost(whitened_residual(case.graph, answer.x))
-    print(f'{name}: {answer.seconds:.2f} s, chi2 {chi2:.10g}, at most {most:.2f} GB', flush=True)
+    print(f'{solver.name}: {answer.seconds:.2f} s, chi2 {chi2:.10g}, at most {most:.2f} GB',
+          flush=True)
 
 
 if __name__ == '__main__':
