@@ -105,7 +105,7 @@ def _gtsam_answer(work: Callable[[], Any]) -> Answer:
 
 
 def _gtsam_by(optimiser: str, parameters: str,
-              ordering: str = '') -> Callable[[Case, Array], Callable[[], Answer]]:
+              ordering: str = 'COLAMD') -> Callable[[Case, Array], Callable[[], Answer]]:
     def prepare(case: Case, poses: Array) -> Callable[[], Answer]:
         import gtsam
 
@@ -113,8 +113,7 @@ def _gtsam_by(optimiser: str, parameters: str,
         options = getattr(gtsam, parameters)()
         options.setRelativeErrorTol(SAME_TOLERANCE)
         options.setMaxIterations(MOST_ITERATIONS)
-        if ordering:
-            options.setOrderingType(ordering)
+        options.setOrderingType(ordering)
         make = getattr(gtsam, optimiser)
         return lambda: _gtsam_answer(lambda: make(graph, values, options).optimize())
 
