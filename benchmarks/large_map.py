@@ -145,8 +145,13 @@ def _played(sizes: Sizes) -> Iterator[Iterator[Message]]:
     player = context.Process(target=_play, args=(there, sizes))
     player.start()
     there.close()
-    yield iter(here.recv, None)
-    player.join()
+    try:
+        yield iter(here.recv, None)
+    except BaseException:
+        player.terminate()  # else it would wait for ever to be heard
+        raise
+    finally:
+        player.join()
 
 
 def _play(there: Connection, sizes: Sizes) -> None:

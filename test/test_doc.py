@@ -60,6 +60,7 @@ NOT_RUN = {
     'python benchmarks/incremental.py': PEERS,
     'python benchmarks/cli/startup.py': MINUTES,
     'python benchmarks/large_map.py': MINUTES,
+    'python benchmarks/large_l2.py': PEERS,
     'python benchmarks/ros/large.py': MINUTES,
     'python benchmarks/ros/clocks.py': MINUTES,
     'python benchmarks/ros/small.py': MINUTES,

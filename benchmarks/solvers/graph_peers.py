@@ -104,7 +104,8 @@ def _gtsam_answer(work: Callable[[], Any]) -> Answer:
     return Answer(poses, seconds)
 
 
-def _gtsam_by(optimiser: str, parameters: str) -> Callable[[Case, Array], Callable[[], Answer]]:
+def _gtsam_by(optimiser: str, parameters: str,
+              ordering: str = 'COLAMD') -> Callable[[Case, Array], Callable[[], Answer]]:
     def prepare(case: Case, poses: Array) -> Callable[[], Answer]:
         import gtsam
 
@@ -112,6 +113,7 @@ def _gtsam_by(optimiser: str, parameters: str) -> Callable[[Case, Array], Callab
         options = getattr(gtsam, parameters)()
         options.setRelativeErrorTol(SAME_TOLERANCE)
         options.setMaxIterations(MOST_ITERATIONS)
+        options.setOrderingType(ordering)
         make = getattr(gtsam, optimiser)
         return lambda: _gtsam_answer(lambda: make(graph, values, options).optimize())
 
@@ -204,6 +206,12 @@ def _g2o_graph(graph: FactorGraph, poses: Array, algorithm: str) -> tuple[Any, A
     stop = g2o.SparseOptimizerTerminateAction()
     stop.set_max_iterations(MOST_ITERATIONS)
     return optimiser, stop
+
+
+def gauss_newton_by(ordering: str) -> GraphSolver:
+    """Return gtsam's Gauss-Newton by METIS or COLAMD."""
+    return GraphSolver(f'gtsam, L2 Gauss-Newton, {ordering}', _gtsam_by(
+        'GaussNewtonOptimizer', 'GaussNewtonParams', ordering))
 
 
 # What the ratios of the whole solves are to.

@@ -176,7 +176,8 @@ def _from_poses(name: str, solve: Callable[[FactorGraph, Array], Array]) -> Grap
 
 
 DEFAULT = _l1(AUTO)
-WHOLE = (DEFAULT, _l1(INTERIOR_POINT), _l1(PRIMAL_DUAL), _from_poses('ours, L2', _l2))
+L2 = _from_poses('ours, L2', _l2)
+WHOLE = (DEFAULT, _l1(INTERIOR_POINT), _l1(PRIMAL_DUAL), L2)
 FROM_NOTHING = (_from_poses('ours, seed', _seed), _from_poses('ours, seed and L1', _seed_and_l1))
 
 

@@ -69,8 +69,7 @@ _NUMBER, _BYTES_PER_ENTRY = 8, 190
 # entry, and for each of a block of the Cholesky factor; how many factorisations they need, and how
 # many multiplications a second has: measured on a core of the machine of doc/performance.md.
 _SECONDS_PER_ENTRY, _SECONDS_PER_FILL = 4.3e-7, 1.05e-7
-_FACTORISATIONS = 20
-_RATE = 1e10
+_FACTORISATIONS, _RATE = 20, 1e10
 # From so many keyframes on steps become more, as their fourth root: 14 of 10,000 keyframes, 19,
 # 25, 31 and 45 of 25,000, 100,000, 200,000 and 1,000,000.
 _WIDE_GRAPH = 10_000
@@ -122,8 +121,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
     before : of fewer keyframes and factors. Up to `GROWN` times as many, only keyframes that new
         factors join and those above them in the elimination tree are ordered anew: that takes a
         fifth of the time, and fills in little more
-    uses : factorisations to come, None: those of an exact L1 map; for few, separators are not
-        worth the time
+    uses : factorisations to come, None: those of an exact L1 map; few do not pay for separators
 
     Raises
     ------
@@ -137,14 +135,16 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
         if pattern is not None and pattern.blocks <= most_blocks:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
-    uses = uses or _factorisations(size)
-    vast = max(VAST, _SEARCH * size * _RATE / uses)
+    vast = max(VAST, _SEARCH * size * _RATE / (uses or _factorisations(size)))
     is_crowded = len(graph[1]) >= _CROWDED * size
-    for dissect, least in (kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, vast):
+    searches = [(kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, vast)]
+    stages: list[Places] = []
+    for dissect, least in searches[::-1 if size > _WIDE_GRAPH else 1]:
         if pattern is None or (not is_crowded and pattern.work * k**3 > max(_LONG * size, least)):
-            dissected = _laid_out(graph, most_blocks, dissect(*graph), _NO_COLUMNS, size)
-            if dissected and not (pattern and pattern.work <= dissected.work):
-                pattern = dissected
+            stages.append(dissect(*graph))
+            if kernels.dissection.is_promising(stages):
+                found = _laid_out(graph, most_blocks, stages[-1], _NO_COLUMNS, size)
+                pattern = min(filter(None, (pattern, found)), key=lambda p: p.work, default=None)
     blocks = most_blocks + 1 if pattern is None else pattern.blocks
     if pattern is None or blocks > most_blocks:
         raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors has '

@@ -240,13 +240,25 @@ def test_the_loops_of_dissection_are_called_with_the_types_that_they_say():
 
 
 def test_of_many_streets_separators_spare_a_third_of_the_work(rng):
-    """Minimum degree and levels do 1.5 and 1.7 times as much."""
+    """Minimum degree and levels do 1.5 and 1.7 times as much; their separators promise as much."""
     n = 16_000
     factors = simulate_world(n, 2 * n, WorldOptions(), rng).graph.between
     graph = adjacency_of(np.stack((factors.i, factors.j), axis=1).tolist(), n)
-    own = work(graph, dissection.dissect(*graph))
+    by_separators = dissection.dissect(*graph)
+    by_levels = ordering.dissect(*graph)
+    own = work(graph, by_separators)
     assert 1.4 * own < work(graph, np.zeros(n, np.int32))
-    assert 1.5 * own < work(graph, ordering.dissect(*graph))
+    assert 1.5 * own < work(graph, by_levels)
+    assert not dissection.is_promising([by_separators, by_levels])
+
+
+def test_where_levels_are_the_better_order_they_promise_to_be(rng):
+    graph = adjacency_of([*path(3600, rng), *((k, k + 60) for k in range(3540))], 3600)
+    by_separators = dissection.dissect(*graph)
+    by_levels = ordering.dissect(*graph)
+    assert work(graph, by_levels) < work(graph, by_separators)
+    assert dissection.is_promising([by_separators, by_levels])
+    assert not dissection.is_promising([by_levels, by_separators])
 
 
 # What follows from an order

@@ -12,6 +12,6 @@ What only large graphs need: the separators that hold them together.
 These loops are compiled when a graph is first that large, and are no step of a start.
 """
 
-from l1slam_ros.core.kernels.dissection.parts import dissect
+from l1slam_ros.core.kernels.dissection.parts import dissect, is_promising
 
-__all__ = ['dissect']
+__all__ = ['dissect', 'is_promising']
