@@ -10,7 +10,7 @@
 
 import numpy as np
 import pytest
-from lies import position_error
+from lies import position_error, slipped
 from problems import chain_of, graph_of, retold
 
 from l1slam_ros.core.robust import batch_map
@@ -95,3 +95,14 @@ def test_of_turns_more_that_loops_fit_the_one_is_taken_that_leaves_the_largest_m
     if not doubtful:
         assert judgement.drift == pytest.approx(drift, abs=2e-3)
         assert position_error(poses, truth) < 3
+
+
+@pytest.mark.parametrize('seed', [2, 5])
+def test_a_jump_that_a_lap_closes_within_its_noise_is_a_slip(seed):
+    """No loop is refused for it, but the robot never moved so: the map was off twice as far."""
+    graph, truth = ring(400, 20, seed)
+    jumped = slipped(with_lies(graph, truth, 'random', 10, seed), [200], [0.0, 5.0, 0.0])
+    poses, judgement, doubts = judged(jumped)
+    slip, = graph.between.i[judgement.slips]
+    assert abs(slip - 200) < 5 and not doubts
+    assert position_error(poses, truth) < 0.9

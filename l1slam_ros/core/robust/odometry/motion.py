@@ -54,17 +54,18 @@ class Motion:
         """Return how unusual steps (m, k) are, squared, and ln det of their covariances, (m,)."""
         return _square(step - self.mean, self.covariance + spread)
 
-    def log_density(self, step: Array, spread: Array | float = 0.0) -> Array:
-        """Return the logarithm of the density of steps (m, k), known to spread (m, k, k), (m,)."""
+    def log_density(self, step: Array, spread: Array | float = 0.0, own: bool = False) -> Array:
+        """Return ln of the density of steps (m, k), known to spread (m, k, k) or its own, (m,)."""
         square, log_det = self.square(step, spread)
-        k = len(self.mean)
+        n, k = self.step.shape
+        if own:  # each by all others: a jump would widen what it is judged by
+            square /= np.maximum(1 - square / n, 1 / n)
         normal = -(square + k * np.log(2 * np.pi)) / 2
         # From the density of the square to that of a point on its ellipsoid.
-        tail = (np.log(self.power / np.sqrt(len(self.step))) + self.power * np.log(self.start)
+        tail = (np.log(self.power / np.sqrt(n)) + self.power * np.log(self.start)
                 - (self.power + k / 2) * np.log(np.maximum(square, self.start))
                 + lgamma(k / 2) - k / 2 * np.log(np.pi))
         square, wide = _square(step, self.rare + spread)
-        n = len(self.step)
         rare = -(square + wide + k * np.log(2 * np.pi)) / 2 - np.log(n)
         return np.logaddexp(np.maximum(normal, tail) - log_det / 2, rare)
 
@@ -148,7 +149,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     J = manifold.local_jacobian(start, moved)
     claims = claimed_volume(manifold, growth.poses).sum()
     motions = motion.log_density(manifold.local(start, moved), J @ spread @ J.transpose(0, 2, 1))
-    odds[rows] = motions - motion.log_density(steps_of(growth, rows)) - fit - (
+    odds[rows] = motions - motion.log_density(steps_of(growth, rows), own=True) - fit - (
         claims + np.log(len(rows)))
     return odds
 

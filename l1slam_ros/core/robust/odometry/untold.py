@@ -39,8 +39,8 @@ def untold_slip(growth: Growth, shown: Shown) -> dict[int, float]:
     """
     Return ln of the odds that a step slipped of which no accepted loop tells, by the step.
 
-    Of all such steps together, by the likeliest one; {}: there is none, or nothing that is
-    refused tells of it either. shown : see `shown_slips`
+    Of all such steps together, by the likeliest one; {}: there is none, or nothing is refused.
+    shown : see `shown_slips`
     """
     given = growth.given
     _, steps, odds = shown
@@ -50,9 +50,7 @@ def untold_slip(growth: Growth, shown: Shown) -> dict[int, float]:
     if not len(odds) or not untold.any():
         return {}
     by_step = np.logaddexp.reduce(odds[:, untold], axis=0)
-    all_of_them = float(np.logaddexp.reduce(by_step))
-    return {int(steps[untold][np.argmax(by_step)]): all_of_them} if np.isfinite(
-        all_of_them) else {}
+    return {int(steps[untold][np.argmax(by_step)]): float(np.logaddexp.reduce(by_step))}
 
 
 def shown_slips(growth: Growth, motion: Motion) -> Shown:
