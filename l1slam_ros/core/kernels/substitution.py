@@ -15,6 +15,75 @@ Rows of a panel are taken three at a time, so that what is read of the solution 
 import numpy as np
 
 from l1slam_ros.core.kernels.compiled import compiled, loop
+from l1slam_ros.core.kernels.vectors.inline import Inline
+
+# Rows of a block of whole poses in the plane and in space; panels of no more block columns are
+# taken one of these after the other.
+_PLANE, _SPACE, _THIN = 3, 6, 4
+
+
+def _forward_of(k):
+    """Return what does `_forward` for one block column of k columns."""
+
+    def forward_tile(vectors, panels, begin, stride, rows, count, x):
+        """rows : (count,) positions, the column's own first; begin : of its own block."""
+        panel = vectors.at(panels, begin)
+        to = vectors.at(x, vectors.times(vectors.entry(rows, 0), k))
+        own = []
+        for r in range(k):
+            row = vectors.at(panel, vectors.times(stride, r))
+            value = vectors.entry(to, r)
+            for c in range(r):
+                value = vectors.reduced(value, vectors.entry(row, c), own[c])
+            own.append(vectors.over(value, vectors.entry(row, r)))
+        for r in range(k):
+            vectors.put(own[r], vectors.at(to, r))
+        with vectors.range(count, 1) as block:
+            first = vectors.times(block, k)
+            to = vectors.at(x, vectors.times(vectors.entry(rows, block), k))
+            for r in range(k):
+                row = vectors.at(vectors.at(panel, vectors.times(stride, first)),
+                                 vectors.times(stride, r))
+                value = vectors.entry(to, r)
+                for c in range(k):
+                    value = vectors.reduced(value, vectors.entry(row, c), own[c])
+                vectors.put(value, vectors.at(to, r))
+
+    return Inline(forward_tile, 1)
+
+
+def _backward_of(k):
+    """Return what does `_backward` for one block column of k columns."""
+
+    def backward_tile(vectors, panels, begin, stride, rows, count, x):
+        """rows : (count,) positions, the column's own first; begin : of its own block."""
+        mask = vectors.first(k)
+        panel = vectors.at(panels, begin)
+        total = vectors.variable(vectors.zeros)
+        with vectors.range(count, 1) as block:
+            first = vectors.times(block, k)
+            below = vectors.at(x, vectors.times(vectors.entry(rows, block), k))
+            for r in range(k):
+                row = vectors.at(vectors.at(panel, vectors.times(stride, first)),
+                                 vectors.times(stride, r))
+                vectors.add(total, vectors.load(row, mask), vectors.spread(
+                    vectors.entry(below, r)))
+        to = vectors.at(x, vectors.times(vectors.entry(rows, 0), k))
+        vectors.store(vectors.less(vectors.load(to, mask), total), to, mask)
+        own = [vectors.entry(to, r) for r in range(k)]
+        for r in range(k - 1, -1, -1):
+            row = vectors.at(panel, vectors.times(stride, r))
+            own[r] = vectors.over(own[r], vectors.entry(row, r))
+            for c in range(r):
+                own[c] = vectors.reduced(own[c], vectors.entry(row, c), own[r])
+            vectors.put(own[r], vectors.at(to, r))
+
+    return Inline(backward_tile, _LANES[k])
+
+
+_LANES = {_PLANE: 4, _SPACE: 8}
+_forward_plane, _backward_plane = _forward_of(_PLANE), _backward_of(_PLANE)
+_forward_space, _backward_space = _forward_of(_SPACE), _backward_of(_SPACE)
 
 
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i4[::1], f8[:, ::1])')
@@ -30,10 +99,30 @@ def solve(panels, first, start, pattern, offset, stride, position, right):
         tallest = max(tallest, start[s + 1] - start[s])
     place = np.empty(tallest * k, np.int64)
     for s in range(len(first) - 1):
+        width = first[s + 1] - first[s]
+        if width <= _THIN and (k == _PLANE or k == _SPACE):
+            for c in range(width):
+                begin, at = offset[s] + c * k * (stride[s] + 1), start[s] + c
+                rows, count = pattern[at:], start[s + 1] - at
+                if k == _PLANE:
+                    _forward_plane(panels, begin, stride[s], rows, count, x)
+                else:
+                    _forward_space(panels, begin, stride[s], rows, count, x)
+            continue
         height = _write_places(pattern[start[s]:start[s + 1]], k, place)
         own = x[first[s] * k:first[s + 1] * k]
         _forward(panels[offset[s]:offset[s + 1]], stride[s], place[:height], own, x)
     for s in range(len(first) - 2, -1, -1):
+        width = first[s + 1] - first[s]
+        if width <= _THIN and (k == _PLANE or k == _SPACE):
+            for c in range(width - 1, -1, -1):
+                begin, at = offset[s] + c * k * (stride[s] + 1), start[s] + c
+                rows, count = pattern[at:], start[s + 1] - at
+                if k == _PLANE:
+                    _backward_plane(panels, begin, stride[s], rows, count, x)
+                else:
+                    _backward_space(panels, begin, stride[s], rows, count, x)
+            continue
         height = _write_places(pattern[start[s]:start[s + 1]], k, place)
         own = x[first[s] * k:first[s + 1] * k]
         _backward(panels[offset[s]:offset[s + 1]], stride[s], place[:height], own, x)
