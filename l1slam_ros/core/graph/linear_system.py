@@ -194,12 +194,8 @@ def neighbours(keyframe: Indices, size: int) -> tuple[NDArray[np.int32], NDArray
 
     Each once, ascending, both ways round; keyframe, size : see `LinearSystem`
     """
-    i, j = keyframe[(keyframe < size).all(axis=1)].T
-    # Not by `np.unique`, whose table of hashes takes longer than to sort.
-    joined = np.sort(np.concatenate((i * size + j, j * size + i)))
-    row, adjacent = np.divmod(joined[np.diff(joined, prepend=-1) > 0], max(size, 1))
-    start = np.searchsorted(row, np.arange(size + 1)).astype(np.int32)
-    return start, adjacent.astype(np.int32)
+    start, adjacent = kernels.symbolic.neighbours(np.ascontiguousarray(keyframe), size)
+    return start, adjacent
 
 
 def step_poses(graph: FactorGraph, poses: Array, x: Array) -> Array:

@@ -10,6 +10,9 @@
 Solving with the factor that `cholesky` left in the panels, forwards and backwards.
 
 Rows of a panel are taken three at a time, so that what is read of the solution serves all three.
+Most panels of a sparse graph are one keyframe wide: those are taken block by block, by loops
+whose bounds are known when they are compiled, for a loop over three numbers takes longer to begin
+than to run.
 """
 
 import numpy as np
@@ -17,8 +20,8 @@ import numpy as np
 from l1slam_ros.core.kernels.compiled import compiled, loop
 from l1slam_ros.core.kernels.vectors.inline import Inline
 
-# Rows of a block of whole poses in the plane and in space; panels of no more block columns are
-# taken one of these after the other.
+# Rows of a block of whole poses in the plane and in space. Panels of no more block columns are
+# taken one such column after the other.
 _PLANE, _SPACE, _THIN = 3, 6, 4
 
 
@@ -26,7 +29,7 @@ def _forward_of(k):
     """Return what does `_forward` for one block column of k columns."""
 
     def forward_tile(vectors, panels, begin, stride, rows, count, x):
-        """rows : (count,) positions, the column's own first; begin : of its own block."""
+        """Take rows : (count,) positions, the column's own first; begin : of its own block."""
         panel = vectors.at(panels, begin)
         to = vectors.at(x, vectors.times(vectors.entry(rows, 0), k))
         own = []
@@ -56,7 +59,7 @@ def _backward_of(k):
     """Return what does `_backward` for one block column of k columns."""
 
     def backward_tile(vectors, panels, begin, stride, rows, count, x):
-        """rows : (count,) positions, the column's own first; begin : of its own block."""
+        """Take rows : (count,) positions, the column's own first; begin : of its own block."""
         mask = vectors.first(k)
         panel = vectors.at(panels, begin)
         total = vectors.variable(vectors.zeros)
@@ -100,7 +103,7 @@ def solve(panels, first, start, pattern, offset, stride, position, right):
     place = np.empty(tallest * k, np.int64)
     for s in range(len(first) - 1):
         width = first[s + 1] - first[s]
-        if width <= _THIN and (k == _PLANE or k == _SPACE):
+        if width <= _THIN and k in (_PLANE, _SPACE):
             for c in range(width):
                 begin, at = offset[s] + c * k * (stride[s] + 1), start[s] + c
                 rows, count = pattern[at:], start[s + 1] - at
@@ -114,7 +117,7 @@ def solve(panels, first, start, pattern, offset, stride, position, right):
         _forward(panels[offset[s]:offset[s + 1]], stride[s], place[:height], own, x)
     for s in range(len(first) - 2, -1, -1):
         width = first[s + 1] - first[s]
-        if width <= _THIN and (k == _PLANE or k == _SPACE):
+        if width <= _THIN and k in (_PLANE, _SPACE):
             for c in range(width - 1, -1, -1):
                 begin, at = offset[s] + c * k * (stride[s] + 1), start[s] + c
                 rows, count = pattern[at:], start[s + 1] - at

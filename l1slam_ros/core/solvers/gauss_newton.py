@@ -74,9 +74,8 @@ class LeastSquaresOptions:
 
     iterations : most linearisations; tolerance : converged when the cost fell by no more than this
     part of itself; huber_delta : length of a factor's whitened residual where Huber turns linear
-    [sigmas]; surprise : converged, too, when an undamped step lowered the cost by what its linear
-    problem promised, to within this part of the cost: then that much is left, and no step is spent
-    on finding out.
+    [sigmas]; surprise : converged, too, after an undamped step that lowered the cost by what its
+    linear problem promised, to within this part of the cost: about as much is left.
     """
 
     iterations: int = 100
@@ -86,7 +85,7 @@ class LeastSquaresOptions:
 
 
 # As much as a start of an exact L1 map needs.
-ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-3, surprise=1e-3)
+ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-3)
 
 
 def minimise_l2(

@@ -94,14 +94,6 @@ class _Iterate:
     def residual(self) -> Array:
         return self.system.residual
 
-    # Sums are made in place: on a large graph, memory that is new takes longer than they do.
-    @property
-    def gap(self) -> float:
-        """The complementarity u's + v't."""
-        products = self.u * self.s
-        products += self.v * self.t
-        return float(products.sum())
-
     @property
     def bounded(self) -> tuple[Array, Array, Array, Array]:
         """The variables that must stay positive: u, v, s, t."""
@@ -109,15 +101,9 @@ class _Iterate:
 
     def advance(self, direction: '_Direction', primal: float) -> None:
         """Go along a direction, u and v so far; the slacks stay positive."""
-        self.u, self.v, self.s, self.t, self.y = kernels.interior_point.advance(
+        kernels.interior_point.advance(
             *self.bounded, self.y, *direction.products, direction.y, primal, direction.dual,
             _SMALLEST_SLACK)
-
-    def check_termination(self, cost: float, tolerance: float) -> bool:
-        """Tell whether |e - u + v|_1 and u's + v't are below a part of the cost."""
-        # The gap first: it is seldom small enough, and takes less to sum up.
-        return (self.gap <= tolerance * cost
-                and l1_cost(self.residual - self.u + self.v) <= tolerance * cost)
 
 
 @dataclass(frozen=True)
@@ -202,8 +188,9 @@ def interior_point(
     status = Status.ITERATION_LIMIT
     worst = 1 + tolerance
     for iteration in range(iterations + 1):
-        cost = l1_cost(at.residual)
-        if at.check_termination(cost, tolerance) or fits_exactly(cost, len(at.y)):
+        cost, gap, apart = kernels.interior_point.missing(*at.bounded, at.residual)
+        small = tolerance * cost
+        if (gap <= small and apart <= small) or fits_exactly(cost, len(at.y)):
             status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
         if cost <= costs[-1]:
             best = replace(at)
@@ -235,6 +222,17 @@ def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: 
     Q, gap = kernels.interior_point.weigh(*at.bounded)
     if not curvature.factorise(at.system, Q, problem.curvature(at.poses, at.y), cholesky):
         return False
+    combined = _direction(at, cholesky, Q, gap)
+    if not np.isfinite(combined.x).all():
+        return False
+    primal, at.poses, residual = _line_search(problem, at, combined, _DEPARTURE * gap)
+    at.system = problem.linearise(at.poses, residual)
+    at.advance(combined, primal)
+    return True
+
+
+def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, gap: float) -> _Direction:
+    """Return the combined step by the last factorisation; gap : u's + v't."""
     state = (*at.bounded, Q, at.residual, at.y)
     mean = gap / (2 * len(at.y))
     affine = _aimed(state, at, cholesky, 0.0)
@@ -253,12 +251,7 @@ def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: 
         # Some products u s and v t are far smaller than others: first make them equal.
         centring = _aimed(state, at, cholesky, mean)
         combined = max(combined, centring, key=lambda step: step.reach)
-    if not np.isfinite(combined.x).all():
-        return False
-    primal, at.poses, residual = _line_search(problem, at, combined, _DEPARTURE * gap)
-    at.system = problem.linearise(at.poses, residual)
-    at.advance(combined, primal)
-    return True
+    return combined
 
 
 def _aimed(state: tuple[Array, ...], at: _Iterate, cholesky: BlockCholesky,
