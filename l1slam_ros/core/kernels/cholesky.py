@@ -91,8 +91,7 @@ def _blocks_tile(vectors, panels, begin, width, rows, count, local, column, stri
     """
     Subtract products of blocks in the plane with the first of them from another panel.
 
-    begin, width : of the blocks, one below the other; rows : (count,) their positions; local,
-    column, stride : where to subtract: of each position, where its row begins; and the column
+    begin, width : of the blocks; rows : (count,) their positions; local, column, stride : where to
     """
     mask = vectors.first(_PLANE)
     source = vectors.at(panels, begin)
@@ -132,19 +131,14 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
     Returns the first position whose pivot is not positive; the number of positions when all are.
     """
     count, n = len(first) - 1, first[-1]
-    local = np.empty(n, np.int64)
-    tallest = d * _begin_share(reach, start, pattern, owner, share, mine, lists)
-    place, target = np.empty(tallest, np.int64), np.empty(tallest, np.int64)
-    least = np.empty(tallest)
-    packed = np.zeros(_WIDE * (tallest + _WIDE + 1))
+    local, place, target, least, packed = _work_space(
+        n, d * _begin_share(reach, start, pattern, owner, share, mine, lists))
     for s in range(count):
         if share[s] != mine:
             continue
-        width = (first[s + 1] - first[s]) * d
-        for k in range(start[s], start[s + 1]):
-            local[pattern[k]] = offset[s] + (k - start[s]) * d * stride[s]
-        for c in range(width):
-            least[c] = _SINGULAR * panels[offset[s] + c * (stride[s] + 1)]
+        width, height = _begin_panel(
+            panels, offset[s], stride[s], pattern[start[s]:start[s + 1]], first[s + 1] - first[s],
+            d, local, least)
         source = lists[0, s]
         while source >= 0:
             next_source = lists[1, source]
@@ -155,9 +149,9 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
             if d == _PLANE and inner <= _THIN:
                 for c in range(columns):
                     for q in range(top, top + inner, _PLANE):
-                        begin = q + c * _PLANE * stride[source]
-                        _subtract_blocks(panels, begin, stride[source], rows[c:], len(rows) - c,
-                                         local, (rows[c] - first[s]) * _PLANE, stride[s])
+                        _subtract_blocks(
+                            panels, q + c * _PLANE * stride[source], stride[source], rows[c:],
+                            len(rows) - c, local, (rows[c] - first[s]) * _PLANE, stride[s])
             else:
                 _find_places(rows, columns, local, first[s], stride[s], d, place, target)
                 _subtract(panels[top:], stride[source], inner, len(rows) * d, columns * d, panels,
@@ -165,19 +159,33 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
             reach[source] += columns
             _enqueue(source, reach, start, pattern, owner, share, mine, lists)
             source = next_source
-        height = (start[s + 1] - start[s]) * d
         if width == _PLANE:
             bad = _factorise_block(panels[offset[s]:], stride[s], height, least)
         else:
-            for r in range(height):
-                place[r] = offset[s] + r * stride[s]
-                target[r] = r
-            bad = _factorise_panel(panels, stride[s], height, width, least, place, target, packed)
+            bad = _factorise_panel(panels, offset[s], stride[s], height, width, least, place,
+                                   target, packed)
         if bad < width:
             return first[s] + bad // d
         reach[s] = first[s + 1] - first[s]
         _enqueue(s, reach, start, pattern, owner, share, mine, lists)
     return n
+
+
+@compiled
+def _work_space(n, tallest):
+    """Return room for local, place, target, least and packed."""
+    return (np.empty(n, np.int64), np.empty(tallest, np.int64), np.empty(tallest, np.int64),
+            np.empty(tallest), np.zeros(_WIDE * (tallest + _WIDE + 1)))
+
+
+@compiled
+def _begin_panel(panels, begin, stride, rows, columns, d, local, least):
+    """Write where a panel's rows begin, and what pivots must exceed; return width and height."""
+    for k in range(len(rows)):
+        local[rows[k]] = begin + k * d * stride
+    for c in range(columns * d):
+        least[c] = _SINGULAR * panels[begin + c * (stride + 1)]
+    return columns * d, len(rows) * d
 
 
 @compiled
@@ -290,21 +298,23 @@ def _factorise_block(panel, stride, height, least):
 
 
 @compiled
-def _factorise_panel(panels, stride, height, width, least, place, target, packed):
+def _factorise_panel(panels, begin, stride, height, width, least, place, target, packed):
     """
     Factor the diagonal block of a panel and solve for the rest; return the bad column.
 
-    least : (width,) what each pivot must exceed; place : (height,) where its rows begin; target :
-    0, 1, 2, ...
+    begin : of the panel; least : (width,) what each pivot must exceed; others : work space
     """
+    for r in range(height):
+        place[r] = begin + r * stride
+        target[r] = r
     for c in range(0, width, _WIDE):
         columns = min(_WIDE, width - c)
-        begin = place[c]
+        top = place[c]
         if c:
-            _subtract(panels[begin:], stride, c, height - c, columns, panels, place[c:],
+            _subtract(panels[top:], stride, c, height - c, columns, panels, place[c:],
                       target[c:], packed)
         lanes = _WIDE if columns > _NARROW else _NARROW
-        bad = _factorise_corner(panels[begin + c:], stride, columns, least[c:], lanes, packed)
+        bad = _factorise_corner(panels[top + c:], stride, columns, least[c:], lanes, packed)
         if bad < columns:
             return c + bad
         for r in range(c + columns, height, _ROWS):

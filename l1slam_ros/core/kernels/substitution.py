@@ -104,13 +104,8 @@ def solve(panels, first, start, pattern, offset, stride, position, right):
     for s in range(len(first) - 1):
         width = first[s + 1] - first[s]
         if width <= _THIN and k in (_PLANE, _SPACE):
-            for c in range(width):
-                begin, at = offset[s] + c * k * (stride[s] + 1), start[s] + c
-                rows, count = pattern[at:], start[s + 1] - at
-                if k == _PLANE:
-                    _forward_plane(panels, begin, stride[s], rows, count, x)
-                else:
-                    _forward_space(panels, begin, stride[s], rows, count, x)
+            _forward_blocks(panels, offset[s], stride[s], pattern[start[s]:start[s + 1]], width, k,
+                            x)
             continue
         height = _write_places(pattern[start[s]:start[s + 1]], k, place)
         own = x[first[s] * k:first[s + 1] * k]
@@ -118,13 +113,8 @@ def solve(panels, first, start, pattern, offset, stride, position, right):
     for s in range(len(first) - 2, -1, -1):
         width = first[s + 1] - first[s]
         if width <= _THIN and k in (_PLANE, _SPACE):
-            for c in range(width - 1, -1, -1):
-                begin, at = offset[s] + c * k * (stride[s] + 1), start[s] + c
-                rows, count = pattern[at:], start[s + 1] - at
-                if k == _PLANE:
-                    _backward_plane(panels, begin, stride[s], rows, count, x)
-                else:
-                    _backward_space(panels, begin, stride[s], rows, count, x)
+            _backward_blocks(panels, offset[s], stride[s], pattern[start[s]:start[s + 1]], width,
+                             k, x)
             continue
         height = _write_places(pattern[start[s]:start[s + 1]], k, place)
         own = x[first[s] * k:first[s + 1] * k]
@@ -134,6 +124,28 @@ def solve(panels, first, start, pattern, offset, stride, position, right):
         for a in range(k):
             solution[f, a] = x[position[f] * k + a]
     return solution
+
+
+@compiled
+def _forward_blocks(panels, begin, stride, rows, width, k, x):
+    """Do what `_forward` does for a panel of few block columns; rows : its positions."""
+    for c in range(width):
+        at = begin + c * k * (stride + 1)
+        if k == _PLANE:
+            _forward_plane(panels, at, stride, rows[c:], len(rows) - c, x)
+        else:
+            _forward_space(panels, at, stride, rows[c:], len(rows) - c, x)
+
+
+@compiled
+def _backward_blocks(panels, begin, stride, rows, width, k, x):
+    """Do what `_backward` does for a panel of few block columns; rows : its positions."""
+    for c in range(width - 1, -1, -1):
+        at = begin + c * k * (stride + 1)
+        if k == _PLANE:
+            _backward_plane(panels, at, stride, rows[c:], len(rows) - c, x)
+        else:
+            _backward_space(panels, at, stride, rows[c:], len(rows) - c, x)
 
 
 @compiled
