@@ -104,7 +104,8 @@ def _gtsam_answer(work: Callable[[], Any]) -> Answer:
     return Answer(poses, seconds)
 
 
-def _gtsam_by(optimiser: str, parameters: str) -> Callable[[Case, Array], Callable[[], Answer]]:
+def _gtsam_by(optimiser: str, parameters: str,
+              ordering: str = 'COLAMD') -> Callable[[Case, Array], Callable[[], Answer]]:
     def prepare(case: Case, poses: Array) -> Callable[[], Answer]:
         import gtsam
 
@@ -112,6 +113,7 @@ def _gtsam_by(optimiser: str, parameters: str) -> Callable[[Case, Array], Callab
         options = getattr(gtsam, parameters)()
         options.setRelativeErrorTol(SAME_TOLERANCE)
         options.setMaxIterations(MOST_ITERATIONS)
+        options.setOrderingType(ordering)
         make = getattr(gtsam, optimiser)
         return lambda: _gtsam_answer(lambda: make(graph, values, options).optimize())
 
@@ -211,6 +213,8 @@ GAUSS_NEWTON = GraphSolver(
     'gtsam, L2 Gauss-Newton', _gtsam_by('GaussNewtonOptimizer', 'GaussNewtonParams'))
 IN_SPACE = (
     GAUSS_NEWTON,
+    GraphSolver('gtsam, L2 Gauss-Newton, METIS',
+                _gtsam_by('GaussNewtonOptimizer', 'GaussNewtonParams', 'METIS')),
     GraphSolver('gtsam, L2 Levenberg-Marquardt',
                 _gtsam_by('LevenbergMarquardtOptimizer', 'LevenbergMarquardtParams')),
     GraphSolver('gtsam, L1 by reweighting', _gtsam_l1(*_CONVERGED)),

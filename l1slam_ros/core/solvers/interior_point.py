@@ -183,12 +183,13 @@ def interior_point(
     """
     at = _start(problem, poses)
     costs = [l1_cost(at.residual)]
-    best = at
+    best = replace(at)
     curvature = Curvature()
     status = Status.ITERATION_LIMIT
     worst = 1 + tolerance
     for iteration in range(iterations + 1):
-        cost, gap, apart = kernels.interior_point.missing(*at.bounded, at.residual)
+        cost = l1_cost(at.residual)
+        gap, apart = kernels.interior_point.missing(*at.bounded, at.residual)
         small = tolerance * cost
         if (gap <= small and apart <= small) or fits_exactly(cost, len(at.y)):
             status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
