@@ -36,9 +36,9 @@ _TOLERANCE = 2e-5
 # first steps of the run allow: nine worlds of 25,000 to 100,000 keyframes took 254 factorisations,
 # the worst 49; with it 223 and 31, its own included.
 _ONE_STEP = replace(ROUGH_L2, iterations=1)
-# In the plane no step is spent on finding out that one left nothing. With 1e-3 for it Intel and City
-# save a factorisation, too, but of 40 straight ways with few loops 32 are solved for 36; with this,
-# 38. In space a start that is off by 4e-8 led the garage to 34 factorisations for 23.
+# In the plane no step is spent on finding out that one left nothing. With 1e-3 for it Intel and
+# City save a factorisation, too, but of 40 straight ways with few loops 32 are solved for 36; with
+# this, 38. In space a start that is off by 4e-8 led the garage to 34 factorisations for 23.
 _ROUGH_IN_PLANE = replace(ROUGH_L2, surprise=1e-6)
 # Converged must also mean that no step of the last linear problem would lower the cost by more
 # than this part: with many false loops it can come to rest where one would.
