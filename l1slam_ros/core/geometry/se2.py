@@ -72,6 +72,9 @@ def between(a: Array, b: Array) -> Array:
 
 def retract(pose: Array, step: Array) -> Array:
     """Return pose v2t(step); a pose of SE(2) and its tangent share their coordinates."""
+    if pose.ndim == 2 and pose.shape == step.shape:
+        return kernels.se2.retract(np.ascontiguousarray(pose, float),
+                                   np.ascontiguousarray(step, float))
     return compose(pose, step)
 
 
@@ -94,9 +97,7 @@ def adjoint(pose: Array) -> Array:
 
 def residual(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     """Return t2v(Z^-1 Xi^-1 Xj), (n, 3)."""
-    e: Array = kernels.se2.residual(measurement, pose_i, pose_j)
-    e[:, 2] = wrap(e[:, 2])
-    return e
+    return kernels.se2.residual(measurement, pose_i, pose_j)
 
 
 def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> Array:

@@ -13,16 +13,18 @@ In: a graph, or a linear system in the place of one. Out: its residual, linearis
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from l1slam_ros.core import kernels
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import (
     LinearSystem,
     anchor,
     ends,
+    keyframes_of,
     linearise,
     step_poses,
     whitened_residual,
@@ -36,13 +38,17 @@ class GraphProblem:
 
     graph: FactorGraph
 
+    @cached_property
+    def _keyframe(self) -> Indices:
+        return keyframes_of(self.graph, anchor(self.graph))
+
     def residual(self, poses: Array) -> Array:
         """Return the whitened residual, (rows,)."""
         return whitened_residual(self.graph, poses)
 
     def linearise(self, poses: Array, residual: Array) -> LinearSystem:
         """Return the linear system whose b is minus the residual."""
-        return linearise(self.graph, poses, residual)
+        return linearise(self.graph, poses, residual, keyframe=self._keyframe)
 
     def step(self, poses: Array, x: Array) -> Array:
         """Return the poses moved by x (columns,)."""

@@ -146,8 +146,9 @@ def with_world(manifold: Manifold, poses: Array) -> Array:
 def ends(graph: FactorGraph, poses: Array) -> tuple[Array, Array]:
     """Return the poses of the ends i and j of each between factor, (m, p) each."""
     factors = graph.between
-    poses = with_world(graph.manifold, poses)
-    return poses.take(factors.i, axis=0), poses.take(factors.j, axis=0)
+    of_i, of_j = kernels.blocks.ends(
+        np.ascontiguousarray(poses), graph.manifold.identity(1), factors.i, factors.j)
+    return of_i, of_j
 
 
 def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
@@ -159,7 +160,7 @@ def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
 
 
 def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,
-              fixed: int | None = None) -> LinearSystem:
+              fixed: int | None = None, keyframe: Indices | None = None) -> LinearSystem:
     """
     Return the system at `poses` (n, p); Jacobians with respect to right steps.
 
@@ -167,6 +168,7 @@ def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,
     ----------
     residual : of these poses, where it is known already
     fixed : how many keyframes are held in the gauge of another graph; None: see `anchor`
+    keyframe : what `keyframes_of` returns for them, where it is known already
 
     """
     factors = graph.between
@@ -176,7 +178,8 @@ def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,
     if residual is None:
         residual = whitened_residual(graph, poses)
     fixed = anchor(graph) if fixed is None else fixed
-    return LinearSystem(keyframes_of(graph, fixed), blocks, -residual, graph.n_poses - fixed)
+    keyframe = keyframes_of(graph, fixed) if keyframe is None else keyframe
+    return LinearSystem(keyframe, blocks, -residual, graph.n_poses - fixed)
 
 
 def keyframes_of(graph: FactorGraph, fixed: int) -> Indices:
@@ -191,12 +194,8 @@ def neighbours(keyframe: Indices, size: int) -> tuple[NDArray[np.int32], NDArray
 
     Each once, ascending, both ways round; keyframe, size : see `LinearSystem`
     """
-    i, j = keyframe[(keyframe < size).all(axis=1)].T
-    # Not by `np.unique`, whose table of hashes takes longer than to sort.
-    joined = np.sort(np.concatenate((i * size + j, j * size + i)))
-    row, adjacent = np.divmod(joined[np.diff(joined, prepend=-1) > 0], max(size, 1))
-    start = np.searchsorted(row, np.arange(size + 1)).astype(np.int32)
-    return start, adjacent.astype(np.int32)
+    start, adjacent = kernels.symbolic.neighbours(np.ascontiguousarray(keyframe), size)
+    return start, adjacent
 
 
 def step_poses(graph: FactorGraph, poses: Array, x: Array) -> Array:

@@ -29,6 +29,10 @@ _SINGULAR = 1e-13
 # Rows and columns of a tile, and columns of a narrow one: as many sums as registers hold.
 _ROWS, _WIDE, _NARROW = 6, 8, 4
 
+# Rows of a block of whole poses in the plane, and most columns of a source of such blocks that is
+# subtracted block by block: a tile takes longer to begin than so few products.
+_PLANE, _THIN = 3, 12
+
 _PANELS = 'f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1]'
 
 
@@ -83,6 +87,31 @@ def _pack_tile(vectors, source, stride, rows, inner, packed):
                       vectors.at(packed, vectors.times(q, vectors.lanes)))
 
 
+def _blocks_tile(vectors, panels, begin, width, rows, count, local, column, stride):
+    """
+    Subtract products of blocks in the plane with the first of them from another panel.
+
+    begin, width : of the blocks; rows : (count,) their positions; local, column, stride : where to
+    """
+    mask = vectors.first(_PLANE)
+    source = vectors.at(panels, begin)
+    right = [[vectors.entry(vectors.at(source, vectors.times(width, r)), q)
+              for r in range(_PLANE)] for q in range(_PLANE)]
+    right = [vectors.gathered(numbers) for numbers in right]
+    with vectors.range(count) as k:
+        block = vectors.at(source, vectors.times(vectors.times(width, _PLANE), k))
+        to = vectors.at(panels, vectors.entry(local, vectors.entry(rows, k)))
+        to = vectors.at(to, column)
+        for r in range(_PLANE):
+            row = vectors.at(block, vectors.times(width, r))
+            total = vectors.variable(vectors.zeros)
+            for q in range(_PLANE):
+                vectors.add(total, vectors.spread(vectors.entry(row, q)), right[q])
+            where = vectors.at(to, vectors.times(stride, r))
+            vectors.store(vectors.less(vectors.load(where, mask), total), where, mask)
+
+
+_subtract_blocks = Inline(_blocks_tile, _NARROW)
 _subtract_wide, _subtract_narrow = (Inline(_subtract_tile, lanes) for lanes in (_WIDE, _NARROW))
 _pack_wide, _pack_narrow = (Inline(_pack_tile, lanes) for lanes in (_WIDE, _NARROW))
 _solve_wide, _solve_narrow = (Inline(_solve_tile, lanes) for lanes in (_WIDE, _NARROW))
@@ -102,19 +131,14 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
     Returns the first position whose pivot is not positive; the number of positions when all are.
     """
     count, n = len(first) - 1, first[-1]
-    local = np.empty(n, np.int64)
-    tallest = d * _begin_share(reach, start, pattern, owner, share, mine, lists)
-    place, target = np.empty(tallest, np.int64), np.empty(tallest, np.int64)
-    least = np.empty(tallest)
-    packed = np.zeros(_WIDE * (tallest + _WIDE + 1))
+    local, place, target, least, packed = _work_space(
+        n, d * _begin_share(reach, start, pattern, owner, share, mine, lists))
     for s in range(count):
         if share[s] != mine:
             continue
-        width = (first[s + 1] - first[s]) * d
-        for k in range(start[s], start[s + 1]):
-            local[pattern[k]] = offset[s] + (k - start[s]) * d * stride[s]
-        for c in range(width):
-            least[c] = _SINGULAR * panels[offset[s] + c * (stride[s] + 1)]
+        width, height = _begin_panel(
+            panels, offset[s], stride[s], pattern[start[s]:start[s + 1]], first[s + 1] - first[s],
+            d, local, least)
         source = lists[0, s]
         while source >= 0:
             next_source = lists[1, source]
@@ -122,22 +146,46 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
             inner = (first[source + 1] - first[source]) * d
             top = offset[source] + reach[source] * d * stride[source]
             columns = _within(rows, first[s + 1])
-            _find_places(rows, columns, local, first[s], stride[s], d, place, target)
-            _subtract(panels[top:], stride[source], inner, len(rows) * d, columns * d, panels,
-                      place, target, packed)
+            if d == _PLANE and inner <= _THIN:
+                for c in range(columns):
+                    for q in range(top, top + inner, _PLANE):
+                        _subtract_blocks(
+                            panels, q + c * _PLANE * stride[source], stride[source], rows[c:],
+                            len(rows) - c, local, (rows[c] - first[s]) * _PLANE, stride[s])
+            else:
+                _find_places(rows, columns, local, first[s], stride[s], d, place, target)
+                _subtract(panels[top:], stride[source], inner, len(rows) * d, columns * d, panels,
+                          place, target, packed)
             reach[source] += columns
             _enqueue(source, reach, start, pattern, owner, share, mine, lists)
             source = next_source
-        height = (start[s + 1] - start[s]) * d
-        for r in range(height):
-            place[r] = offset[s] + r * stride[s]
-            target[r] = r
-        bad = _factorise_panel(panels, stride[s], height, width, least, place, target, packed)
+        if width == _PLANE:
+            bad = _factorise_block(panels[offset[s]:], stride[s], height, least)
+        else:
+            bad = _factorise_panel(panels, offset[s], stride[s], height, width, least, place,
+                                   target, packed)
         if bad < width:
             return first[s] + bad // d
         reach[s] = first[s + 1] - first[s]
         _enqueue(s, reach, start, pattern, owner, share, mine, lists)
     return n
+
+
+@compiled
+def _work_space(n, tallest):
+    """Return room for local, place, target, least and packed."""
+    return (np.empty(n, np.int64), np.empty(tallest, np.int64), np.empty(tallest, np.int64),
+            np.empty(tallest), np.zeros(_WIDE * (tallest + _WIDE + 1)))
+
+
+@compiled
+def _begin_panel(panels, begin, stride, rows, columns, d, local, least):
+    """Write where a panel's rows begin, and what pivots must exceed; return width and height."""
+    for k in range(len(rows)):
+        local[rows[k]] = begin + k * d * stride
+    for c in range(columns * d):
+        least[c] = _SINGULAR * panels[begin + c * (stride + 1)]
+    return columns * d, len(rows) * d
 
 
 @compiled
@@ -220,21 +268,53 @@ def _subtract(source, stride, inner, height, columns, panels, place, target, pac
 
 
 @compiled
-def _factorise_panel(panels, stride, height, width, least, place, target, packed):
+def _factorise_block(panel, stride, height, least):
+    """Do what `_factorise_panel` does, for a panel of one block column in the plane."""
+    if not panel[0] > max(least[0], 0.0):
+        return 0
+    d0 = np.sqrt(panel[0])
+    i0 = 1 / d0
+    l10, l20 = panel[stride] * i0, panel[2 * stride] * i0
+    d1 = panel[stride + 1] - l10 * l10
+    if not d1 > max(least[1], 0.0):
+        return 1
+    d1 = np.sqrt(d1)
+    i1 = 1 / d1
+    l21 = (panel[2 * stride + 1] - l20 * l10) * i1
+    d2 = panel[2 * stride + 2] - l20 * l20 - l21 * l21
+    if not d2 > max(least[2], 0.0):
+        return 2
+    d2 = np.sqrt(d2)
+    i2 = 1 / d2
+    panel[0], panel[stride], panel[stride + 1] = d0, l10, d1
+    panel[2 * stride], panel[2 * stride + 1], panel[2 * stride + 2] = l20, l21, d2
+    for r in range(_PLANE, height):
+        row = panel[r * stride:]
+        x0 = row[0] * i0
+        x1 = (row[1] - x0 * l10) * i1
+        row[0], row[1] = x0, x1
+        row[2] = (row[2] - x0 * l20 - x1 * l21) * i2
+    return _PLANE
+
+
+@compiled
+def _factorise_panel(panels, begin, stride, height, width, least, place, target, packed):
     """
     Factor the diagonal block of a panel and solve for the rest; return the bad column.
 
-    least : (width,) what each pivot must exceed; place : (height,) where its rows begin; target :
-    0, 1, 2, ...
+    begin : of the panel; least : (width,) what each pivot must exceed; others : work space
     """
+    for r in range(height):
+        place[r] = begin + r * stride
+        target[r] = r
     for c in range(0, width, _WIDE):
         columns = min(_WIDE, width - c)
-        begin = place[c]
+        top = place[c]
         if c:
-            _subtract(panels[begin:], stride, c, height - c, columns, panels, place[c:],
+            _subtract(panels[top:], stride, c, height - c, columns, panels, place[c:],
                       target[c:], packed)
         lanes = _WIDE if columns > _NARROW else _NARROW
-        bad = _factorise_corner(panels[begin + c:], stride, columns, least[c:], lanes, packed)
+        bad = _factorise_corner(panels[top + c:], stride, columns, least[c:], lanes, packed)
         if bad < columns:
             return c + bad
         for r in range(c + columns, height, _ROWS):

@@ -58,6 +58,14 @@ def _turns(poses):
 
 
 @compiled
+def _wrapped(angle):
+    """Return an angle [rad] in (-pi, pi], see `se2.wrap`."""
+    angle -= 2 * np.pi * np.rint(angle / (2 * np.pi))
+    # By comparisons that NaN fails, so that it stays.
+    return np.pi if angle <= -np.pi or angle > np.pi else angle
+
+
+@compiled
 def _seen(x_i, x_j, c, s):
     """Return Ri'(tj - ti), the position of j seen from i; c, s : cosine and sine of i's angle."""
     dx, dy = x_j[0] - x_i[0], x_j[1] - x_i[1]
@@ -72,7 +80,7 @@ def _turn_between(c_i, s_i, c_j, s_j):
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1])')
 def residual(z, x_i, x_j):
-    """Return e (m, 3), its angle not yet wrapped."""
+    """Return e (m, 3)."""
     e = np.empty_like(z)
     c_z, s_z = _turns(z)
     c_i, s_i = _turns(x_i)
@@ -81,8 +89,20 @@ def residual(z, x_i, x_j):
         tx, ty = _seen(x_i[f], x_j[f], c_i[f], s_i[f])
         e[f, 0] = c * (tx - z[f, 0]) + s * (ty - z[f, 1])
         e[f, 1] = c * (ty - z[f, 1]) - s * (tx - z[f, 0])
-        e[f, 2] = x_j[f, 2] - x_i[f, 2] - z[f, 2]
+        e[f, 2] = _wrapped(x_j[f, 2] - x_i[f, 2] - z[f, 2])
     return e
+
+
+@loop('(f8[:, ::1], f8[:, ::1])', brief=True)
+def retract(poses, steps):
+    """Return poses v2t(step), (n, 3)."""
+    moved = np.empty_like(poses)
+    c, s = _turns(poses)
+    for k in range(len(poses)):
+        moved[k, 0] = poses[k, 0] + (c[k] * steps[k, 0] - s[k] * steps[k, 1])
+        moved[k, 1] = poses[k, 1] + (s[k] * steps[k, 0] + c[k] * steps[k, 1])
+        moved[k, 2] = _wrapped(poses[k, 2] + steps[k, 2])
+    return moved
 
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1])')

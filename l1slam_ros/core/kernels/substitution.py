@@ -10,11 +10,83 @@
 Solving with the factor that `cholesky` left in the panels, forwards and backwards.
 
 Rows of a panel are taken three at a time, so that what is read of the solution serves all three.
+Most panels of a sparse graph are one keyframe wide: those are taken block by block, by loops
+whose bounds are known when they are compiled, for a loop over three numbers takes longer to begin
+than to run.
 """
 
 import numpy as np
 
 from l1slam_ros.core.kernels.compiled import compiled, loop
+from l1slam_ros.core.kernels.vectors.inline import Inline
+
+# Rows of a block of whole poses in the plane and in space. Panels of no more block columns are
+# taken one such column after the other.
+_PLANE, _SPACE, _THIN = 3, 6, 4
+
+
+def _forward_of(k):
+    """Return what does `_forward` for one block column of k columns."""
+
+    def forward_tile(vectors, panels, begin, stride, rows, count, x):
+        """Take rows : (count,) positions, the column's own first; begin : of its own block."""
+        panel = vectors.at(panels, begin)
+        to = vectors.at(x, vectors.times(vectors.entry(rows, 0), k))
+        own = []
+        for r in range(k):
+            row = vectors.at(panel, vectors.times(stride, r))
+            value = vectors.entry(to, r)
+            for c in range(r):
+                value = vectors.reduced(value, vectors.entry(row, c), own[c])
+            own.append(vectors.over(value, vectors.entry(row, r)))
+        for r in range(k):
+            vectors.put(own[r], vectors.at(to, r))
+        with vectors.range(count, 1) as block:
+            first = vectors.times(block, k)
+            to = vectors.at(x, vectors.times(vectors.entry(rows, block), k))
+            for r in range(k):
+                row = vectors.at(vectors.at(panel, vectors.times(stride, first)),
+                                 vectors.times(stride, r))
+                value = vectors.entry(to, r)
+                for c in range(k):
+                    value = vectors.reduced(value, vectors.entry(row, c), own[c])
+                vectors.put(value, vectors.at(to, r))
+
+    return Inline(forward_tile, 1)
+
+
+def _backward_of(k):
+    """Return what does `_backward` for one block column of k columns."""
+
+    def backward_tile(vectors, panels, begin, stride, rows, count, x):
+        """Take rows : (count,) positions, the column's own first; begin : of its own block."""
+        mask = vectors.first(k)
+        panel = vectors.at(panels, begin)
+        total = vectors.variable(vectors.zeros)
+        with vectors.range(count, 1) as block:
+            first = vectors.times(block, k)
+            below = vectors.at(x, vectors.times(vectors.entry(rows, block), k))
+            for r in range(k):
+                row = vectors.at(vectors.at(panel, vectors.times(stride, first)),
+                                 vectors.times(stride, r))
+                vectors.add(total, vectors.load(row, mask), vectors.spread(
+                    vectors.entry(below, r)))
+        to = vectors.at(x, vectors.times(vectors.entry(rows, 0), k))
+        vectors.store(vectors.less(vectors.load(to, mask), total), to, mask)
+        own = [vectors.entry(to, r) for r in range(k)]
+        for r in range(k - 1, -1, -1):
+            row = vectors.at(panel, vectors.times(stride, r))
+            own[r] = vectors.over(own[r], vectors.entry(row, r))
+            for c in range(r):
+                own[c] = vectors.reduced(own[c], vectors.entry(row, c), own[r])
+            vectors.put(own[r], vectors.at(to, r))
+
+    return Inline(backward_tile, _LANES[k])
+
+
+_LANES = {_PLANE: 4, _SPACE: 8}
+_forward_plane, _backward_plane = _forward_of(_PLANE), _backward_of(_PLANE)
+_forward_space, _backward_space = _forward_of(_SPACE), _backward_of(_SPACE)
 
 
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i4[::1], f8[:, ::1])')
@@ -30,10 +102,20 @@ def solve(panels, first, start, pattern, offset, stride, position, right):
         tallest = max(tallest, start[s + 1] - start[s])
     place = np.empty(tallest * k, np.int64)
     for s in range(len(first) - 1):
+        width = first[s + 1] - first[s]
+        if width <= _THIN and k in (_PLANE, _SPACE):
+            _forward_blocks(panels, offset[s], stride[s], pattern[start[s]:start[s + 1]], width, k,
+                            x)
+            continue
         height = _write_places(pattern[start[s]:start[s + 1]], k, place)
         own = x[first[s] * k:first[s + 1] * k]
         _forward(panels[offset[s]:offset[s + 1]], stride[s], place[:height], own, x)
     for s in range(len(first) - 2, -1, -1):
+        width = first[s + 1] - first[s]
+        if width <= _THIN and k in (_PLANE, _SPACE):
+            _backward_blocks(panels, offset[s], stride[s], pattern[start[s]:start[s + 1]], width,
+                             k, x)
+            continue
         height = _write_places(pattern[start[s]:start[s + 1]], k, place)
         own = x[first[s] * k:first[s + 1] * k]
         _backward(panels[offset[s]:offset[s + 1]], stride[s], place[:height], own, x)
@@ -42,6 +124,28 @@ def solve(panels, first, start, pattern, offset, stride, position, right):
         for a in range(k):
             solution[f, a] = x[position[f] * k + a]
     return solution
+
+
+@compiled
+def _forward_blocks(panels, begin, stride, rows, width, k, x):
+    """Do what `_forward` does for a panel of few block columns; rows : its positions."""
+    for c in range(width):
+        at = begin + c * k * (stride + 1)
+        if k == _PLANE:
+            _forward_plane(panels, at, stride, rows[c:], len(rows) - c, x)
+        else:
+            _forward_space(panels, at, stride, rows[c:], len(rows) - c, x)
+
+
+@compiled
+def _backward_blocks(panels, begin, stride, rows, width, k, x):
+    """Do what `_backward` does for a panel of few block columns; rows : its positions."""
+    for c in range(width - 1, -1, -1):
+        at = begin + c * k * (stride + 1)
+        if k == _PLANE:
+            _backward_plane(panels, at, stride, rows[c:], len(rows) - c, x)
+        else:
+            _backward_space(panels, at, stride, rows[c:], len(rows) - c, x)
 
 
 @compiled

@@ -22,6 +22,43 @@ from l1slam_ros.core.kernels.compiled import compiled, loop
 _ZEROS = 0.1
 
 
+@loop('(i8[:, ::1], i8)')
+def neighbours(keyframe, size):
+    """Return the neighbours of each node, see `linear_system.neighbours`."""
+    begin = np.zeros(size + 1, np.int64)
+    for f in range(len(keyframe)):
+        i, j = keyframe[f, 0], keyframe[f, 1]
+        if i < size and j < size:
+            begin[i + 1] += 1
+            begin[j + 1] += 1
+    for k in range(size):
+        begin[k + 1] += begin[k]
+    other, sorted_ = np.empty(begin[size], np.int32), np.empty(begin[size], np.int32)
+    end = begin[:size].copy()
+    for f in range(len(keyframe)):
+        i, j = keyframe[f, 0], keyframe[f, 1]
+        if i < size and j < size:
+            other[end[i]] = j
+            end[i] += 1
+            other[end[j]] = i
+            end[j] += 1
+    # Given to their neighbours in order, nodes come in order.
+    end[:] = begin[:size]
+    for k in range(size):
+        for at in range(begin[k], begin[k + 1]):
+            to = other[at]
+            sorted_[end[to]] = k
+            end[to] += 1
+    start, count = np.zeros(size + 1, np.int32), 0
+    for k in range(size):
+        for at in range(begin[k], begin[k + 1]):
+            if at == begin[k] or sorted_[at] != sorted_[at - 1]:
+                sorted_[count] = sorted_[at]
+                count += 1
+        start[k + 1] = count
+    return start, sorted_[:count].copy()
+
+
 @loop('(i4[::1], i8[::1], i4[::1])')
 def lay_out(order, column, rows):
     """

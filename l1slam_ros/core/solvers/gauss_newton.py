@@ -74,12 +74,14 @@ class LeastSquaresOptions:
 
     iterations : most linearisations; tolerance : converged when the cost fell by no more than this
     part of itself; huber_delta : length of a factor's whitened residual where Huber turns linear
-    [sigmas].
+    [sigmas]; surprise : converged, too, after an undamped step that lowered the cost by what its
+    linear problem promised, to within this part of the cost: about as much is left.
     """
 
     iterations: int = 100
     tolerance: float = 1e-9
     huber_delta: float = 1.345
+    surprise: float = 0.0
 
 
 # As much as a start of an exact L1 map needs.
@@ -160,7 +162,8 @@ def _descend(
         report(len(history) - 1, here.cost)
         # By a step as good as undamped; at the optimum rounding may let the cost rise a little.
         if (full and abs(decrease) <= little and predicted <= max(little, decrease / _LAST)) or (
-                free and abs(decrease - predicted) < surprise):
+                free and abs(decrease - predicted) < max(
+                    surprise, options.surprise * here.cost)):
             status = Status.CONVERGED
             break
         if damping > _MOST_DAMPING:

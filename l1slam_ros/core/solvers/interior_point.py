@@ -94,21 +94,6 @@ class _Iterate:
     def residual(self) -> Array:
         return self.system.residual
 
-    # Sums are made in place: on a large graph, memory that is new takes longer than they do.
-    @property
-    def gap(self) -> float:
-        """The complementarity u's + v't."""
-        products = self.u * self.s
-        products += self.v * self.t
-        return float(products.sum())
-
-    @property
-    def weights(self) -> Array:
-        """Q = 1 / (u/s + v/t)."""
-        Q = self.u / self.s
-        Q += self.v / self.t
-        return np.divide(1, Q, out=Q)
-
     @property
     def bounded(self) -> tuple[Array, Array, Array, Array]:
         """The variables that must stay positive: u, v, s, t."""
@@ -116,15 +101,9 @@ class _Iterate:
 
     def advance(self, direction: '_Direction', primal: float) -> None:
         """Go along a direction, u and v so far; the slacks stay positive."""
-        self.u, self.v, self.s, self.t, self.y = kernels.interior_point.advance(
-            self.u, self.v, self.s, self.t, self.y, direction.u, direction.v, direction.y,
-            primal, direction.dual, _SMALLEST_SLACK)
-
-    def check_termination(self, cost: float, tolerance: float) -> bool:
-        """Tell whether |e - u + v|_1 and u's + v't are below a part of the cost."""
-        # The gap first: it is seldom small enough, and takes less to sum up.
-        return (self.gap <= tolerance * cost
-                and l1_cost(self.residual - self.u + self.v) <= tolerance * cost)
+        kernels.interior_point.advance(
+            *self.bounded, self.y, *direction.products, direction.y, primal, direction.dual,
+            _SMALLEST_SLACK)
 
 
 @dataclass(frozen=True)
@@ -145,16 +124,16 @@ class Optimum:
 @dataclass(frozen=True)
 class _Direction:
     """
-    A step of the poses, of the linearised residual, of y, u, v.
+    A step of the poses, of the linearised residual, of y; u and v follow from it.
 
-    primal, dual : how far it can go; gap : u's + v't there
+    products : what u s and v t shall become; primal, dual : how far it can go; gap : u's + v't
+    there
     """
 
     x: Array
     residual: Array
     y: Array
-    u: Array
-    v: Array
+    products: _Products
     primal: float
     dual: float
     gap: float
@@ -204,13 +183,15 @@ def interior_point(
     """
     at = _start(problem, poses)
     costs = [l1_cost(at.residual)]
-    best = at
+    best = replace(at)
     curvature = Curvature()
     status = Status.ITERATION_LIMIT
     worst = 1 + tolerance
     for iteration in range(iterations + 1):
         cost = l1_cost(at.residual)
-        if at.check_termination(cost, tolerance) or fits_exactly(cost, len(at.y)):
+        gap, apart = kernels.interior_point.missing(*at.bounded, at.residual)
+        small = tolerance * cost
+        if (gap <= small and apart <= small) or fits_exactly(cost, len(at.y)):
             status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
         if cost <= costs[-1]:
             best = replace(at)
@@ -239,21 +220,10 @@ def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: 
     They have the names that Clarabel and others give them: the affine step aims at mu = 0, and how
     far it comes says how far the combined step aims.
     """
-    Q, gap = at.weights, at.gap
+    Q, gap = kernels.interior_point.weigh(*at.bounded)
     if not curvature.factorise(at.system, Q, problem.curvature(at.poses, at.y), cholesky):
         return False
-    affine = _solve_kkt(at, cholesky, Q, _affine_step_rhs(at))
-    mu = gap / (2 * len(at.y)) * (affine.gap / gap) ** 3
-    most = gap / (2 * len(at.y)) if len(at.y) > _MANY_ROWS else np.inf
-    rhs = _combined_step_rhs(affine, mu, most)
-    combined = _solve_kkt(at, cholesky, Q, rhs)
-    if not at.is_torn:  # else bends hold a step back rather than bounds
-        corrected = _solve_kkt(at, cholesky, Q, _centrality_corrector_rhs(combined, rhs, mu))
-        combined = max(combined, corrected, key=lambda step: step.reach)
-    if combined.reach < _SHORT:
-        # Some products u s and v t are far smaller than others: first make them equal.
-        centring = _solve_kkt(at, cholesky, Q, _centring_step_rhs(at))
-        combined = max(combined, centring, key=lambda step: step.reach)
+    combined = _direction(at, cholesky, Q, gap)
     if not np.isfinite(combined.x).all():
         return False
     primal, at.poses, residual = _line_search(problem, at, combined, _DEPARTURE * gap)
@@ -262,62 +232,44 @@ def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: 
     return True
 
 
-def _affine_step_rhs(at: _Iterate) -> _Products:
-    """Return the products that the affine step aims at: all of them zero."""
-    zero = np.zeros(len(at.y))
-    return zero, zero
+def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, gap: float) -> _Direction:
+    """Return the combined step by the last factorisation; gap : u's + v't."""
+    state = (*at.bounded, Q, at.residual, at.y)
+    mean = gap / (2 * len(at.y))
+    affine = _aimed(state, at, cholesky, 0.0)
+    mu = mean * (affine.gap / gap) ** 3
+    # Mehrotra's corrector.
+    most = mean if len(at.y) > _MANY_ROWS else np.inf
+    *rhs, pull = kernels.interior_point.aim_combined(*state, affine.y, mu, most)
+    combined = _solve_kkt(state, at, cholesky, (rhs[0], rhs[1]), pull)
+    if not at.is_torn:  # else bends hold a step back rather than bounds
+        # Gondzio's.
+        *rhs, pull = kernels.interior_point.aim_centrally(
+            *state, combined.y, *combined.products, _ALIKE * mu, mu / _ALIKE)
+        corrected = _solve_kkt(state, at, cholesky, (rhs[0], rhs[1]), pull)
+        combined = max(combined, corrected, key=lambda step: step.reach)
+    if combined.reach < _SHORT:
+        # Some products u s and v t are far smaller than others: first make them equal.
+        centring = _aimed(state, at, cholesky, mean)
+        combined = max(combined, centring, key=lambda step: step.reach)
+    return combined
 
 
-def _combined_step_rhs(affine: _Direction, mu: float, most: float) -> _Products:
-    """
-    Return mu, corrected by what the affine step leaves to second order (Mehrotra).
-
-    most : of each correction
-    """
-    of_u, of_v = affine.u * affine.y, affine.v * affine.y
-    if most < np.inf:
-        for left in of_u, of_v:
-            np.clip(left, -most, most, out=left)
-    of_u += mu
-    return of_u, np.subtract(mu, of_v, out=of_v)
+def _aimed(state: tuple[Array, ...], at: _Iterate, cholesky: BlockCholesky,
+           product: float) -> _Direction:
+    """Return the step by which all products become one number; state : see kernels."""
+    products = np.full_like(at.y, product)
+    pull = kernels.interior_point.aim(*state, products, products)
+    return _solve_kkt(state, at, cholesky, (products, products), pull)
 
 
-def _centring_step_rhs(at: _Iterate) -> _Products:
-    """Return the mean of the products for each of them."""
-    mean = np.full(len(at.y), at.gap / (2 * len(at.y)))
-    return mean, mean
-
-
-def _centrality_corrector_rhs(direction: _Direction, rhs: _Products, mu: float) -> _Products:
-    """
-    Return what brings the products at the end of a direction into line with mu (Gondzio).
-
-    Meant to become c1 and c2, they end as c1 - du dy and c2 + dv dy. Of those far too large no
-    more is taken than the most they may be, or they would rule the step.
-    """
-    least = _ALIKE * mu
-    most = mu / _ALIKE
-    of_u, of_v = direction.u * direction.y, direction.v * direction.y
-    ends = np.subtract(rhs[0], of_u, out=of_u), np.add(rhs[1], of_v, out=of_v)
-    wanted = []
-    for c, end in zip(rhs, ends, strict=True):
-        shift = np.clip(end, least, most)
-        shift -= end
-        np.maximum(shift, -most, out=shift)
-        shift += c
-        wanted.append(shift)
-    return wanted[0], wanted[1]
-
-
-def _solve_kkt(at: _Iterate, cholesky: BlockCholesky, Q: Array, rhs: _Products) -> _Direction:
-    """Solve for the step whose complementarity products become `rhs` to first order."""
-    c1, c2 = rhs
-    g, pull = kernels.interior_point.aim(at.residual, at.y, at.s, at.t, Q, c1, c2)
-    x = cholesky.solve(-at.system.transposed_times(pull))
+def _solve_kkt(state: tuple[Array, ...], at: _Iterate, cholesky: BlockCholesky,
+               products: _Products, pull: Array) -> _Direction:
+    """Solve for the step whose complementarity products become these to first order."""
+    x = cholesky.solve(at.system.transposed_times(pull))
     moved = at.system.times(x)
-    y, u, v, primal, dual, gap = kernels.interior_point.complete(
-        *at.bounded, Q, c1, c2, g, moved, _FRACTION)
-    return _Direction(x, moved, y, u, v, primal, dual, gap)
+    y, primal, dual, gap = kernels.interior_point.complete(*state, *products, moved, _FRACTION)
+    return _Direction(x, moved, y, products, primal, dual, gap)
 
 
 def _line_search(problem: L1Problem, at: _Iterate, direction: _Direction,
@@ -330,17 +282,17 @@ def _line_search(problem: L1Problem, at: _Iterate, direction: _Direction,
     """
     length = direction.primal
     while True:
-        linear = length * direction.residual
-        linear += at.residual
         best = np.inf
         for step in problem.step, problem.step_along:
             moved = step(at.poses, length * direction.x)
             after = problem.residual(moved)
-            if not (cost := l1_cost(after)) > best:
+            cost, apart = kernels.interior_point.depart(
+                after, at.residual, direction.residual, length)
+            if not cost > best:
                 best = cost
                 poses = moved
                 residual = after
-                departure = l1_cost(after - linear)
+                departure = apart
             if not at.is_torn and departure <= allowed:
                 break
             at.is_torn = True

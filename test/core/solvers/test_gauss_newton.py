@@ -155,3 +155,15 @@ def test_a_step_that_does_what_it_promised_ends_the_map_within_its_noise(world):
         poses = l2_map(graph, start, cholesky_of(graph), lambda k, cost: steps.append(k))
         assert chi2(graph, poses) < best.cost + 1
     assert steps == [1, 1] and best.outer_iterations > 2
+
+
+def test_no_step_is_spent_on_finding_out_that_little_is_left(world):
+    graph, _ = world
+    start = odometry_poses(graph)
+    to_the_end = solve(minimise_l2, graph, start, LeastSquaresOptions(tolerance=1e-3))
+    surprise = 1e-3
+    sooner = solve(minimise_l2, graph, start,
+                   LeastSquaresOptions(tolerance=1e-3, surprise=surprise))
+    assert sooner.status is Status.CONVERGED
+    assert sooner.outer_iterations == to_the_end.outer_iterations - 1
+    assert sooner.cost <= (1 + surprise) * to_the_end.cost

@@ -8,7 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The interior-point method: linear problems against HiGHS, graphs near their map, its account."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -153,10 +153,11 @@ def test_the_step_solves_the_newton_equations(rows, rng):
     e, (u, v, s, t), y, q, c1, c2 = rows
     moved = rng.standard_normal(50)
     g = e - (u - v) - (c1 / s - u) + (c2 / t - v)
-    found, pull = kernels.aim(e, y, s, t, q, c1, c2)
-    assert_allclose(found, g)
-    assert_allclose(pull, y + q * g)
-    dy, du, dv, primal, dual, _ = kernels.complete(u, v, s, t, q, c1, c2, g, moved, 1.0)
+    state = (u, v, s, t, q, e, y)
+    assert_allclose(kernels.aim(*state, c1, c2), -(y + q * g))
+    dy, primal, dual, _ = kernels.complete(*state, c1, c2, moved, 1.0)
+    assert_allclose(dy, q * (moved + g))
+    du, dv = (c1 + u * dy) / s - u, (c2 - v * dy) / t - v
     assert_allclose(u * s + s * du - u * dy, c1)
     assert_allclose(v * t + t * dv + v * dy, c2)
     assert_allclose((u + du) - (v + dv), e + moved, atol=1e-12)
@@ -164,26 +165,23 @@ def test_the_step_solves_the_newton_equations(rows, rng):
     assert primal < 1 and dual < 1
     assert min((u + primal * du).min(), (v + primal * dv).min()) == pytest.approx(0, abs=1e-12)
     assert min((s - dual * dy).min(), (t + dual * dy).min()) == pytest.approx(0, abs=1e-12)
-    *_, part_primal, part_dual, gap = kernels.complete(u, v, s, t, q, c1, c2, g, moved, 0.9)
+    _, part_primal, part_dual, gap = kernels.complete(*state, c1, c2, moved, 0.9)
     primal, dual = 0.9 * primal, 0.9 * dual
     assert (part_primal, part_dual) == pytest.approx((primal, dual))
     assert gap == pytest.approx((u + primal * du) @ (s - dual * dy)
                                 + (v + primal * dv) @ (t + dual * dy))
     # Small steps meet no bound: they are taken whole.
-    small = kernels.complete(u, v, s, t, q, u * s, v * t, 1e-3 * g, 1e-3 * moved, 0.9)
-    assert small[3:5] == (1, 1)
+    fits = (u, v, s, t, q, u - v + 1e-3 * g, y)
+    assert kernels.complete(*fits, u * s, v * t, 1e-3 * moved, 0.9)[1:3] == (1, 1)
 
 
 def test_a_step_is_taken_and_slacks_stay_positive(rows):
     _, (u, v, s, t), y, *_ = rows
     dy = np.where(y > 0, 9.0, -9.0)
-    du = u.copy()
-    dv = v.copy()
-    at = _Iterate(np.zeros(0), None, u, v, s, t, y)
-    best = replace(at)
-    at.advance(_Direction(np.zeros(0), np.zeros(50), dy, du, dv, 1.0, 0.2, 0.0), 0.3)
+    # What u and v move by: themselves.
+    products = 2 * u * s - u * dy, 2 * v * t + v * dy
+    at = _Iterate(np.zeros(0), None, *(x.copy() for x in (u, v, s, t, y)))
+    at.advance(_Direction(np.zeros(0), np.zeros(50), dy, products, 1.0, 0.2, 0.0), 0.3)
     assert_allclose((at.u, at.v, at.y), (1.3 * u, 1.3 * v, y + 0.2 * dy))
     assert (s - 0.2 * dy < 0).any() and (t + 0.2 * dy < 0).any()
     assert (np.minimum(at.s, at.t) > 0).all()
-    # The best iterate is kept by reference: a step must not write into it.
-    assert best.u is u and best.y is y and best.s is s

@@ -33,7 +33,9 @@ class Instructions:
         self.zeros = self._type([0.0] * lanes)
 
     def _as_number(self, number: Any) -> Any:
-        return self._number(number) if isinstance(number, int) else number
+        if isinstance(number, int):
+            return self._number(number)
+        return self._builder.sext(number, self._number)
 
     def indices(self, count: int, rows: Any) -> list[Any]:
         """Return 0, 1, 2, ..., the last of the rows again where there are no more."""
@@ -64,11 +66,11 @@ class Instructions:
         return self._builder.load(variable)
 
     @contextmanager
-    def range(self, count: Any) -> Iterator[Any]:
-        """Repeat what is written for 0, 1, ... below count."""
+    def range(self, count: Any, begin: int = 0) -> Iterator[Any]:
+        """Repeat what is written for begin, begin + 1, ... below count."""
         from numba.core import cgutils
 
-        with cgutils.for_range(self._builder, count) as loop:
+        with cgutils.for_range(self._builder, count, self._number(begin)) as loop:
             yield loop.index
 
     def spread(self, value: Any) -> Any:
@@ -118,12 +120,24 @@ class Instructions:
         """Return a vector without what a variable has."""
         return self._builder.fsub(value, self._builder.load(total))
 
+    def reduced(self, value: Any, left: Any, right: Any) -> Any:
+        """Return a value less a product, rounded once where the machine can."""
+        product = self._builder.fmul(left, right, flags=('contract',))
+        return self._builder.fsub(value, product, flags=('contract',))
+
     def eliminated(self, row: Any, k: int, below: Any) -> Any:
         """Return a row less its entry k times a vector."""
         index = self._ir.VectorType(self._ir.IntType(32), self.lanes)([k] * self.lanes)
         entry = self._builder.shuffle_vector(row, row, index)
-        product = self._builder.fmul(entry, below, flags=('contract',))
-        return self._builder.fsub(row, product, flags=('contract',))
+        return self.reduced(row, entry, below)
+
+    def over(self, value: Any, divisor: Any) -> Any:
+        """Return a quotient."""
+        return self._builder.fdiv(value, divisor)
+
+    def put(self, value: Any, address: Any) -> None:
+        """Write an entry."""
+        self._builder.store(value, address)
 
     def sum(self, left: Any, right: Any) -> Any:
         """Return the sum of two vectors."""
