@@ -219,8 +219,7 @@ GAUSS_NEWTON = GraphSolver(
     'gtsam, L2 Gauss-Newton', _gtsam_by('GaussNewtonOptimizer', 'GaussNewtonParams'))
 IN_SPACE = (
     GAUSS_NEWTON,
-    GraphSolver('gtsam, L2 Gauss-Newton, METIS',
-                _gtsam_by('GaussNewtonOptimizer', 'GaussNewtonParams', 'METIS')),
+    gauss_newton_by('METIS'),
     GraphSolver('gtsam, L2 Levenberg-Marquardt',
                 _gtsam_by('LevenbergMarquardtOptimizer', 'LevenbergMarquardtParams')),
     GraphSolver('gtsam, L1 by reweighting', _gtsam_l1(*_CONVERGED)),
