@@ -26,7 +26,7 @@ from l1slam_ros.core.graph.linear_system import linearise
 from l1slam_ros.core.names import NORMS
 from l1slam_ros.core.running.backend import Backend, RobustOptions
 from l1slam_ros.core.robust import batch_map
-from l1slam_ros.core.robust.inspection import connected_parts
+from l1slam_ros.core.graph.parts import connected_parts
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares

@@ -34,7 +34,6 @@ from measuring import report_progress
 from robust.sensitivity import compared, modules_of_judgement, telling_cases
 
 from l1slam_ros.core import robust
-from l1slam_ros.core.robust.pairwise_consistency import NO_GROUP
 from l1slam_ros.core.robust.rounds.growth import gain_of_places
 
 _NONE = np.zeros(0, np.int64)
@@ -48,7 +47,7 @@ RULES: dict[str, Callable[..., Any]] = {
     'rounds.growth.Growth._misfits': lambda growth, rows, residual: _NONE,
     'rounds.growth.Growth.accept_tail': lambda growth: None,
     'pairwise_consistency._by_chance': lambda growth, rows: 0.0,
-    'pairwise_consistency.longest_run': lambda growth, rows: NO_GROUP,
+    'pairwise_consistency.longest_run': lambda growth, rows: _NONE,
     'pairwise_consistency.gain_of': gain_of_places,
     'odometry.drift_likelihood.likely_drifts': lambda graph: np.zeros(0),
     'odometry.drift.Straight.fits': lambda straight, loops: (0.0, 0),
@@ -64,7 +63,7 @@ RULES: dict[str, Callable[..., Any]] = {
     'reasons._decides_alone': lambda growth, accepted: False,
     'reasons._joining_alone': lambda growth: iter(()),
     'reasons._joining_otherwise': lambda growth: iter(()),
-    'reasons._may_be_right': lambda growth, group, accepted: False,
+    'reasons._may_be_right': lambda growth, group: False,
     'reasons._may_have_slipped': lambda growth, group: [],
     'batch._norm_doubts': lambda *_: (),
 }

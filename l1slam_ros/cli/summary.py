@@ -17,7 +17,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.manifold import Indices
-from l1slam_ros.core.graph.parts import odometry_gaps
+from l1slam_ros.core.graph.parts import connected_parts, odometry_gaps
 from l1slam_ros.core.names import ANGLE, QUATERNION
 from l1slam_ros.core.robust import inspection
 from l1slam_ros.core.robust.places import first_told
@@ -63,7 +63,7 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
         ('poses', f'{graph.n_poses:,} in {graph.manifold.NAME}, ids {ids[0]} to {ids[-1]}'),
         ('odometry', f'{int(factors.is_odometry.sum()):,}, {length:,.1f} m'),
         ('loops', f'{int(is_loop.sum()):,}{beside}{struck}'),
-        ('components', f'{len(inspection.connected_parts(graph)):,}')]
+        ('components', f'{len(connected_parts(graph)):,}')]
     names = robot_names(ids)
     if len(names) > 1:
         rows.insert(1, ('robots', f'{len(names)}: {", ".join(names)}'))
@@ -101,7 +101,7 @@ def _on_ids(record: GraphRecord) -> Iterator[str]:
 
 
 def _on_parts(record: GraphRecord) -> Iterator[str]:
-    parts = inspection.connected_parts(record.graph)
+    parts = connected_parts(record.graph)
     if len(parts) == 1:
         return
     lonely = [part[0] for part in parts if len(part) == 1]

@@ -19,7 +19,7 @@ from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.robust.inspection import require_connected
+from l1slam_ros.core.graph.parts import require_connected
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions

@@ -7,17 +7,21 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Graphs in several parts, tied together for a solver without changing their optimum.
+Graphs in several parts: which there are, what refuses them, and what ties them together.
 
-In: a graph whose odometry has gaps, or that nothing accepted ties together. Out: the same with a
-factor in each gap that no other factor speaks against.
+In: a graph whose odometry has gaps, or that nothing accepted ties together. Out: its parts, poses
+to begin with, or the same graph with a factor in each gap that no other factor speaks against, so
+that a solver comes to the same optimum.
 """
 
 import numpy as np
 
+from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import NO_PREDECESSOR, FactorGraph, component_labels
+from l1slam_ros.core.graph.spanning_tree import odometry_poses, tree_poses
+from l1slam_ros.core.graph.world_frame import placed
 
 # A gap: each number of the odometry is so many times vaguer, in the mean; and no number is less.
 _VAGUE, _TINY = 21.5, 1e-300
@@ -62,6 +66,48 @@ def vague_odometry(graph: FactorGraph) -> Mask:
 def part_labels(graph: FactorGraph) -> Indices:
     """Return the number of the part of each keyframe, (n,): vague odometry joins none."""
     return component_labels(graph.subset(~vague_odometry(graph)))
+
+
+def connected_parts(graph: FactorGraph) -> list[Indices]:
+    """Return the keyframes of each part of the graph, ascending; the first part has keyframe 0."""
+    labels = component_labels(graph)
+    ends = np.cumsum(np.bincount(labels))[:-1]
+    return np.split(np.argsort(labels, kind='stable'), ends)
+
+
+def require_connected(graph: FactorGraph, ids: Indices) -> None:
+    """
+    Refuse a graph of several parts; ids : (n,) what the keyframes are called.
+
+    Raises
+    ------
+    GraphError : naming a vertex of the loose part.
+
+    """
+    labels = component_labels(graph)
+    loose = np.flatnonzero(labels != labels[0])
+    if len(loose):
+        others = f' and {len(loose) - 1:,} more have' if len(loose) > 1 else ' has'
+        raise GraphError(f'the graph is not connected: vertex {ids[loose[0]]}{others} no path to '
+                         f'vertex {ids[0]}; `l1slam info` lists the parts')
+
+
+def initial_poses(graph: FactorGraph, stored: Array | None, ids: Indices) -> Array:
+    """
+    Return the stored poses, (n, p); where there are none, the odometry chain.
+
+    Where that has gaps, the poses along a breadth-first tree from the first keyframe.
+
+    Raises
+    ------
+    GraphError : none is stored, and the graph is not connected.
+
+    """
+    if stored is not None:
+        return stored
+    require_connected(graph, ids)
+    poses = tree_poses(graph, 0) if len(odometry_gaps(graph)) else odometry_poses(graph)
+    return placed(graph, poses)
 
 
 def bridged(graph: FactorGraph) -> FactorGraph:

@@ -64,12 +64,7 @@ from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.as_measured import FAILURES, Believed, OnRound, as_measured
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
-from l1slam_ros.core.robust.innovation import (
-    BY_CHANCE,
-    chi2_quantile,
-    covariances,
-    spread_of,
-)
+from l1slam_ros.core.robust.innovation import BY_CHANCE, chi2_quantile, covariances, spread_of
 from l1slam_ros.core.robust.inspection import OFF_SCALE
 from l1slam_ros.core.robust.judgement import (
     NORM,
@@ -123,7 +118,7 @@ def robust_solve(
         first.begin()
         for number, growth in enumerate(rounds(first, repair), 1):
             last = so_far(growth, repair.drift), growth.poses
-            report(number, int(np.count_nonzero(growth.accepted & growth.given.is_loop)))
+            report(number, int(np.count_nonzero(growth.loops)))
         reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival)
         return judgement_of(growth, reasons, drift=repair.drift, odds=repair.odds), growth.poses
     except FAILURES as error:
@@ -235,7 +230,7 @@ def _standing(graph: FactorGraph, poses: Array) -> Solution:
 
 def _unsolved(graph: FactorGraph, judgement: Judgement, error: Exception) -> Doubt:
     rows = judgement.accepted & ~graph.between.is_odometry
-    return doubt_of(graph.between.pairs[rows], graph.n_poses, UNSOLVED, str(error))
+    return doubt_of(graph, rows, UNSOLVED, str(error))
 
 
 def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
@@ -301,7 +296,7 @@ def rounds(
         growth.accepted[news] = True
         if len(news):
             growth.solve()
-        elif not join(growth, by_runs=True):
+        elif not join(growth):
             if not found:
                 found = growth.copy() if repaired else growth
                 growth.take_at_their_word()

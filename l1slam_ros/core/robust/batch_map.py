@@ -23,18 +23,18 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
-from l1slam_ros.core.graph.parts import bridged, odometry_gaps, part_labels
+from l1slam_ros.core.graph.parts import (
+    bridged,
+    initial_poses,
+    odometry_gaps,
+    part_labels,
+    require_connected,
+)
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.as_measured import OnRound
 from l1slam_ros.core.robust.batch import RobustMap, minimise_robustly
-from l1slam_ros.core.robust.inspection import (
-    FEWEST,
-    densest_part,
-    initial_poses,
-    lacked_step,
-    require_connected,
-)
+from l1slam_ros.core.robust.inspection import FEWEST, densest_part, lacked_step
 from l1slam_ros.core.robust.judgement import UNSOLVED, Judgement
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of

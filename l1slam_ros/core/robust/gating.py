@@ -43,14 +43,15 @@ _MOST_LIE = np.log(2)
 _FEW = 2e-3
 # The noise is judged by so many of the best predicted factors; half and double make none worse.
 _BEST_PREDICTED = 1000
-# Rounds of expectation and maximisation end where a part of what they find is the same.
-_SAME = 1e-3
+# What differs by no more than this part of it is the same: what rounds of expectation and
+# maximisation find, which end then; how a robot moves.
+SAME = 1e-3
 # How much more the loops' variance may be off than the odometry's, as said or else; another ratio
 # has to make each loop likelier by so much, ln. Half and double change none, but with none FR079's
 # map by wheels is .87 m off for .73, and Intel with noise that is stated wrong loses fewer loops.
 _RATIOS = (1.0, *(10.0**power for power in range(-6, 7) if power))
 _RATIO_COSTS = 0.25
-# Variances are no less, where they would be nothing.
+# Variances are no less, and no information, where they would be nothing.
 TINY = 1e-9
 # Pairs are formed of so many factors that fit best; half and double change 8 and 5, none is worse.
 # By 250 a recorded log, Intel, gets a slip that is none.
@@ -67,7 +68,7 @@ def log_odds_of_false(log_ratio: Array, others: int, believed: int = 0) -> float
     """
     count = len(log_ratio) + others + believed
     odds, before = 0.0, np.inf
-    while abs(odds - before) >= _SAME:
+    while abs(odds - before) >= SAME:
         before = odds
         true = float(probability(log_ratio - odds).sum()) + believed + 1
         odds = float(np.log((count + 2 - true) / true))
@@ -242,7 +243,7 @@ def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indi
     """Return the log likelihood of the best scale of C near a start, and that scale."""
     scale, before = max(start, TINY), np.inf
     start = scale
-    while abs(scale / before - 1) >= _SAME:
+    while abs(scale / before - 1) >= SAME:
         log_ratio = log_likelihood_ratio(square / scale, log_det + freedom * np.log(scale),
                                          log_claim, freedom, k)
         odds = log_odds_of_false(log_ratio, 0)

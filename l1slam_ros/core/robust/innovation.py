@@ -30,11 +30,7 @@ from l1slam_ros.core.geometry.noise import Mask, filled
 from l1slam_ros.core.geometry.quantiles import beta_quantile, gamma_quantile
 from l1slam_ros.core.graph.draws import keys, signs
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
-from l1slam_ros.core.graph.linear_system import (
-    LinearSystem,
-    anchor,
-    linearise,
-)
+from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, linearise
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 _beta_quantile, _gamma_quantile = cache(beta_quantile), cache(gamma_quantile)

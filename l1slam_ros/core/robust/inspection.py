@@ -22,7 +22,7 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask, whiten
 from l1slam_ros.core.geometry.quantiles import gamma_quantile
-from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import (
     LinearSystem,
     anchor,
@@ -31,10 +31,9 @@ from l1slam_ros.core.graph.linear_system import (
     step_part,
     step_poses,
 )
-from l1slam_ros.core.graph.parts import odometry_gaps
-from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key, tree_poses
-from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.robust.innovation import BY_CHANCE
+from l1slam_ros.core.graph.parts import connected_parts
+from l1slam_ros.core.graph.spanning_tree import pair_key, tree_poses
+from l1slam_ros.core.robust.innovation import BY_CHANCE, CHECKED
 from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 
 # A step this many times as long as nine in ten of all steps is no step of the same robot.
@@ -50,9 +49,6 @@ _STEPS = 20
 _TOLERANCE = 0.01
 # Errors that many times as large, or as small, as their information says are worth a sentence.
 OFF_SCALE = 3.0
-# An offset that loops share is larger than the noise of one; where a smaller part of it than this
-# shows in the residuals, the map bends as well.
-_SHOWS = 0.1
 
 
 def parallel_factors(graph: FactorGraph) -> Indices:
@@ -61,13 +57,6 @@ def parallel_factors(graph: FactorGraph) -> Indices:
     _, inverse, counts = np.unique(pair_key(factors.i, factors.j, graph.n_poses),
                                    return_inverse=True, return_counts=True)
     return np.flatnonzero(counts[inverse] > 1)
-
-
-def connected_parts(graph: FactorGraph) -> list[Indices]:
-    """Return the keyframes of each part of the graph, ascending; the first part has keyframe 0."""
-    labels = component_labels(graph)
-    ends = np.cumsum(np.bincount(labels))[:-1]
-    return np.split(np.argsort(labels, kind='stable'), ends)
 
 
 @dataclass(frozen=True)
@@ -169,8 +158,9 @@ def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
     Z is the later keyframe seen from the earlier. With G (rows, k) the derivatives of what d adds,
     the map and d minimise |A x - b - G d|^2, weighted by the variances (2,) of odometry and of
     loops. G_p and r are what the map leaves of G and b: S = G_p'W G_p is the information of d,
-    d = -S^-1 G_p'W r, chi2 = d'S d. Directions in which the map follows are not asked for. The
-    noise is that of loops after d; where it is off scale, false loops may make an offset, so None.
+    d = -S^-1 G_p'W r, chi2 = d'S d. Directions in which the map follows are hardly checked, and
+    not asked for. The noise is that of loops after d; where it is off scale, false loops may make
+    an offset, so None.
     """
     manifold, factors = graph.manifold, graph.between
     k = manifold.TANGENT_SIZE
@@ -186,7 +176,7 @@ def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
     z = weighted.T @ left[:, 0]
     scale = np.sqrt(np.where(np.diag(M) > 0, np.diag(M), 1.0))
     share, V = np.linalg.eigh(S / np.outer(scale, scale))
-    V, share = V[:, share > _SHOWS**2] / scale[:, None], share[share > _SHOWS**2]
+    V, share = V[:, share > CHECKED] / scale[:, None], share[share > CHECKED]
     if not len(share):
         return None
     d = -V @ (V.T @ z / share)
@@ -207,41 +197,6 @@ def _turns(manifold: Manifold, left: Array) -> float:
     square = (left**2).reshape(-1, manifold.TANGENT_SIZE, 2).sum(axis=0)
     found, drawn = (square[part].sum(axis=0) for part in (manifold.ROTATION, manifold.TRANSLATION))
     return float(np.sqrt(found[0] / found[1] * drawn[1] / drawn[0])) if square.all() else np.nan
-
-
-def require_connected(graph: FactorGraph, ids: Indices) -> None:
-    """
-    Refuse a graph of several parts; ids : (n,) what the keyframes are called.
-
-    Raises
-    ------
-    GraphError : naming a vertex of the loose part.
-
-    """
-    labels = component_labels(graph)
-    loose = np.flatnonzero(labels != labels[0])
-    if len(loose):
-        others = f' and {len(loose) - 1:,} more have' if len(loose) > 1 else ' has'
-        raise GraphError(f'the graph is not connected: vertex {ids[loose[0]]}{others} no path to '
-                         f'vertex {ids[0]}; `l1slam info` lists the parts')
-
-
-def initial_poses(graph: FactorGraph, stored: Array | None, ids: Indices) -> Array:
-    """
-    Return the stored poses, (n, p); where there are none, the odometry chain.
-
-    Where that has gaps, the poses along a breadth-first tree from the first keyframe.
-
-    Raises
-    ------
-    GraphError : none is stored, and the graph is not connected.
-
-    """
-    if stored is not None:
-        return stored
-    require_connected(graph, ids)
-    poses = tree_poses(graph, 0) if len(odometry_gaps(graph)) else odometry_poses(graph)
-    return placed(graph, poses)
 
 
 def cost_at(graph: FactorGraph, poses: Array) -> float:

@@ -22,13 +22,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
-from l1slam_ros.core.robust.forecast import (
-    CONFIDENT,
-    forecast,
-    right_within,
-    terms_of,
-    unsureness,
-)
+from l1slam_ros.core.robust.forecast import CONFIDENT, forecast, right_within, terms_of, unsureness
 from l1slam_ros.core.robust.gating import probability
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.pairwise_consistency import RUN
@@ -128,7 +122,7 @@ class Judgement:
         """Return what is believed where judging the loops of a graph came no further."""
         factors = graph.between
         left_out = ~factors.is_odometry & ~factors.struck & ~self.accepted
-        doubt = doubt_of(factors.pairs[left_out], graph.n_poses, FAILED, str(error))
+        doubt = doubt_of(graph, left_out, FAILED, str(error))
         return replace(self, doubts=(doubt,), settled=True, confidence=float('nan'))
 
     def renumbered(self, number: Indices) -> 'Judgement':
@@ -211,9 +205,11 @@ class Judgement:
             settled=not robust or (self.settled and not told and not suspect[known:].any()))
 
 
-def doubt_of(pairs: Indices, n_poses: int, kind: str, detail: str = '') -> Doubt:
-    """Return a doubt about the loops between pairs of keyframes (k, 2), none: about them all."""
-    first, last = (max(int(pairs.min()), 0), int(pairs.max())) if len(pairs) else (0, n_poses - 1)
+def doubt_of(graph: FactorGraph, rows: Indices | Mask, kind: str, detail: str = '') -> Doubt:
+    """Return a doubt about some loops of a graph; none: about all its keyframes."""
+    pairs = graph.between.pairs[rows]
+    first, last = ((max(int(pairs.min()), 0), int(pairs.max())) if len(pairs)
+                   else (0, graph.n_poses - 1))
     return Doubt(kind, len(pairs), first, last, detail, listed(pairs))
 
 
@@ -270,7 +266,7 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float =
     if not drift and np.isfinite(odds) and chance >= CONFIDENT:
         reasons = tuple(doubt for doubt in reasons if doubt.kind != DRIFTS)
     kinds = {doubt.kind for doubt in reasons}
-    accepts_any = bool((given.is_loop & growth.accepted).any())
+    accepts_any = bool(growth.loops.any())
     terms = terms_of(accepts_any, unsure,
                      *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
     confidence = forecast(terms) if loops.any() else float('nan')
@@ -286,9 +282,8 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float =
     if (len(left_out) and np.count_nonzero(loops) >= RUN
             and (suspect[left_out].any() or (noise != 1).any() or not accepts_any)
             and forecast(terms[:3]) < CONFIDENT):
-        metres = unsure * right_within(growth.given.graph.manifold.positions(growth.poses))
-        reasons += (doubt_of(given.factors.pairs[left_out], growth.given.graph.n_poses, WEAK,
-                             f'{metres:.2g}'),)
+        metres = unsure * right_within(given.graph.manifold.positions(growth.poses))
+        reasons += (doubt_of(given.graph, left_out, WEAK, f'{metres:.2g}'),)
     doubted = OTHER_MAP in kinds or bool(
         2 * len(left_out) > np.count_nonzero(loops) >= RUN)
     return replace(believed, suspect=suspect[:size], sigmas=np.sqrt(square[:size]),

@@ -15,8 +15,6 @@ spans a slip of the odometry, or a gap, both sides are right in themselves: ever
 is far off, but all of them agree.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from l1slam_ros.core import kernels
@@ -28,6 +26,7 @@ from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.innovation import claimed_volume, log_claims, log_likelihood_ratio
 from l1slam_ros.core.robust.places import NEAR
+from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 
 # First ends, second ends and measurements of loops.
@@ -38,31 +37,21 @@ ASKED = 250
 _NEAREST = 20
 # A run has so many loops, and each agrees with half as many others of it.
 RUN = 6
-# One that is to outweigh the odometry has so many: of recorded ones five in six are true then.
-_LONG_RUN = 10
 
 
-@dataclass(frozen=True)
-class Group:
-    """Loops that agree: rows (k,), the first one that with which all others do; their places."""
-
-    rows: Indices
-    places: Indices
+NONE: Indices = np.zeros(0, np.int64)
 
 
-NO_GROUP = Group(np.zeros(0, np.int64), np.zeros(0, np.int64))
-
-
-def strongest_group(growth: Growth, rows: Indices) -> Group:
+def strongest_group(growth: Growth, rows: Indices) -> Indices:
     """
-    Return of some loops the group that agrees best, empty where that may be chance.
+    Return of some loops those that agree best, none where that may be chance, (k,).
 
-    Each place counts once, by the best log ratio of its loops, less ln m: each could have agreed
-    by chance with any of the m that were asked.
+    All agree with the first one. Each place counts once, by the best log ratio of its loops, less
+    ln m: each could have agreed by chance with any of the m that were asked.
     """
     rows = asked(growth, rows)
     if len(rows) < 2:
-        return NO_GROUP
+        return NONE
     one, other, log_ratio = agreement(growth, rows)
     _, first, place = np.unique(growth.given.place[rows], return_index=True, return_inverse=True)
     evidence = _evidence(place, one, other, log_ratio)
@@ -70,26 +59,41 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     needed = np.log(len(rows) / DOUBT)
     one_each = rows[np.sort(first)]  # in the order of `asked`, whatever places are called
     if evidence[best] < needed or evidence[best] < needed + _by_chance(growth, one_each):
-        return NO_GROUP
-    found = rows[np.concatenate(([best], other[one == best]))]
-    return Group(found, np.unique(growth.given.place[found]))
+        return NONE
+    group: Indices = rows[np.concatenate(([best], other[one == best]))]
+    return group
 
 
-def strongest_across(growth: Growth) -> Group:
-    """Return the group of most places that agrees how two parts lie to each other, or none."""
-    return max((strongest_group(growth, rows)
-                for rows in by_pair_of_parts(growth, growth.joining())),
-               key=lambda group: len(group.places), default=NO_GROUP)
+def strongest_across(growth: Growth) -> Indices:
+    """
+    Return the loops that agree best how two parts lie to each other, or none, (k,).
+
+    They are of two places or more; where such are not, of one that is a long run.
+    """
+    given, rows = growth.given, growth.joining()
+    pair = pair_key(growth.part[given.low[rows]], growth.part[given.high[rows]],
+                    given.graph.n_poses)
+    by_parts = [rows[pair == one] for one in np.unique(pair)]
+    group = max((strongest_group(growth, some) for some in by_parts), key=given.count_places,
+                default=NONE)
+    if given.count_places(group) >= TWO_PLACES:
+        return group
+    return max((longest_run(growth, some) for some in by_parts), key=len, default=NONE)
 
 
-def longest_run(growth: Growth, rows: Indices) -> Group:
-    """Return of some loops the run that most of them are of, empty where there is none."""
+def longest_run(growth: Growth, rows: Indices) -> Indices:
+    """
+    Return of some loops the run that most of them are of, none where there is none, (k,).
+
+    To outweigh the odometry it is twice as long as others: of recorded ones that have ten loops
+    five in six are true.
+    """
     rows = asked(growth, rows)
-    longest = max(runs(growth, rows), key=lambda group: len(group.rows), default=NO_GROUP)
-    return longest if len(longest.rows) >= max(_LONG_RUN, len(rows) / 2 + 1) else NO_GROUP
+    longest = max(runs(growth, rows), key=len, default=NONE)
+    return longest if len(longest) >= max(2 * RUN, len(rows) / 2 + 1) else NONE
 
 
-def runs(growth: Growth, rows: Indices) -> list[Group]:
+def runs(growth: Growth, rows: Indices) -> list[Indices]:
     """
     Return of some loops those of one place that are no one mistake.
 
@@ -111,7 +115,7 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
         # What both ways together go is more than what is near.
         if min(ways) > NEAR / 2:
             order = np.argsort(-count[own], kind='stable')
-            found.append(Group(rows[own[order]], np.array([number])))
+            found.append(rows[own[order]])
     return found
 
 
@@ -122,11 +126,9 @@ def gain_of(growth: Growth, as_stated: Growth, cut: Growth) -> float:
     A robot that goes the same way again and again sees one place all along: that is won before,
     however many of its loops are refused. So a run of these counts as a place does.
     """
-    is_loop = growth.given.is_loop
-    place = growth.given.place
-    before = growth.accepted & is_loop
-    more = np.flatnonzero(is_loop & cut.accepted & ~before & ~as_stated.accepted
-                          & np.isin(place, place[before]))
+    place, before = growth.given.place, growth.loops
+    more = np.flatnonzero(
+        cut.loops & ~before & ~as_stated.accepted & np.isin(place, place[before]))
     return gain_of_places(growth, as_stated, cut) + growth.given.log_odds_of_place * len(
         runs(cut, more))
 
@@ -236,14 +238,6 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     b = b[good]
     log_ratio = log_ratio[good]
     return np.concatenate((a, b)), np.concatenate((b, a)), np.tile(log_ratio, 2)
-
-
-def by_pair_of_parts(growth: Growth, rows: Indices) -> list[Indices]:
-    """Return some loops from one part to another by the two parts that they join, (k,) each."""
-    given = growth.given
-    pair = pair_key(growth.part[given.low[rows]], growth.part[given.high[rows]],
-                    given.graph.n_poses)
-    return [rows[pair == one] for one in np.unique(pair)]
 
 
 def _ends_by_part(growth: Growth, rows: Indices, high: Indices) -> Ends:

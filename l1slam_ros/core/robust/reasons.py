@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Indices
-from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
 from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise
@@ -54,24 +53,24 @@ def doubts(growth: Growth, ended: bool = True, rival: float = 0.0) -> tuple[Doub
 
     ended : nothing more can be accepted; rival : by how much more the odometry may drift [rad/m]
     """
-    size = growth.given.size
+    graph, size = growth.given.graph, growth.given.size
     loops = growth.given.is_loop[:size]
     left_out = np.flatnonzero(loops & ~growth.accepted[:size])
     accepted = np.flatnonzero(loops & growth.accepted[:size])
     reasons = []
     if not ended and len(left_out):
-        reasons.append(_doubt(growth, UNFINISHED, left_out))
+        reasons.append(doubt_of(graph, left_out, UNFINISHED))
     if _decides_alone(growth, accepted):
-        reasons.append(_doubt(growth, ONE_PLACE, accepted))
+        reasons.append(doubt_of(graph, accepted, ONE_PLACE))
     if growth.given.gap.any():
-        reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
+        reasons += [doubt_of(graph, rows, ONE_JOINS) for rows in _joining_alone(growth)]
     agree = _agree(growth)
     reasons += _other_map(growth, agree)
-    reasons += [_doubt(growth, OTHER_MAP, rows) for rows in _joining_otherwise(growth)]
+    reasons += [doubt_of(graph, rows, OTHER_MAP) for rows in _joining_otherwise(growth)]
     reasons += [_slip_doubt(growth, step) for step in _may_have_slipped(growth, agree)]
     drift = rival or drift_taken_for_noise(growth)
     if drift:
-        reasons.append(replace(_doubt(growth, DRIFTS, accepted), detail=f'{-drift:+.2g}'))
+        reasons.append(doubt_of(graph, accepted, DRIFTS, f'{-drift:+.2g}'))
     return tuple(dict.fromkeys(reasons))
 
 
@@ -142,14 +141,14 @@ def _joining_otherwise(growth: Growth) -> Iterator[Indices]:
     refused = np.isin(rows, growth.undecided())
     for number in np.unique(pair[refused]):
         own = pair == number
-        known = len(np.unique(given.place[rows[own & growth.accepted[rows]]]))
+        known = given.count_places(rows[own & growth.accepted[rows]])
         if not known:
             continue
         group = strongest_group(growth, rows[own & refused])
-        if 2 * len(group.places) < known:
+        if 2 * given.count_places(group) < known:
             group = longest_run(growth, rows[own & refused])
-        if len(group.rows):
-            yield group.rows
+        if len(group):
+            yield group
 
 
 def _agree(growth: Growth) -> list[Indices]:
@@ -157,7 +156,7 @@ def _agree(growth: Growth) -> list[Indices]:
     rows = growth.undecided()
     place = growth.given.place
     agree = agree_at_a_place(growth, rows)
-    groups = [strongest_group(growth, rows).rows, *(
+    groups = [strongest_group(growth, rows), *(
         agree[place[agree] == one] for one in np.unique(place[agree]))]
     return [group for group in groups if len(group)]
 
@@ -169,9 +168,8 @@ def _other_map(growth: Growth, groups: list[Indices]) -> list[Doubt]:
     They may be right then: the odometry slipped, and nothing else knows of it. A place against
     the odometry alone is one word against another.
     """
-    accepted = growth.accepted & growth.given.is_loop
-    alone = [group for group in groups if _may_be_right(growth, group, accepted)]
-    return [_doubt(growth, OTHER_MAP, max(alone, key=len))] if alone else []
+    alone = [group for group in groups if _may_be_right(growth, group)]
+    return [doubt_of(growth.given.graph, max(alone, key=len), OTHER_MAP)] if alone else []
 
 
 def _may_have_slipped(growth: Growth, groups: list[Indices]) -> list[int]:
@@ -188,9 +186,9 @@ def _may_have_slipped(growth: Growth, groups: list[Indices]) -> list[int]:
             if (odds < SURE if growth.cut[step] else odds > alone - SURE * (step in told))]
 
 
-def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:
+def _may_be_right(growth: Growth, group: Indices) -> bool:
     """
-    Return whether a group of loops, (k,), may be right, and no accepted one false, (m,).
+    Return whether a group of loops, (k,), may be right, and no accepted one false.
 
     Then the odometry slipped at a step that the group spans and no accepted loop does. Of all
     steps one is expected to have slipped: if these are less than a hundredth of them, a place is
@@ -198,7 +196,7 @@ def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:
     of line: the odometry slipped to it, and back.
     """
     given = growth.given
-    low, high = given.low, given.high
+    low, high, accepted = given.low, given.high, growth.loops
     across = spanned(low[accepted], high[accepted], given.graph.n_poses)
     untold = np.count_nonzero(across[low[common_steps(growth, group)]] == 0)
     if given.may_err_as_one(group, TWO_PLACES):
@@ -208,14 +206,9 @@ def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:
                                for ends in (low[group], high[group]))
 
 
-def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
-    given = growth.given
-    return doubt_of(given.factors.pairs[rows], given.graph.n_poses, kind)
-
-
 def _slip_doubt(growth: Growth, step: int) -> Doubt:
     given = growth.given
     span = given.spanning(step)
     used = growth.accepted & span
-    doubt = _doubt(growth, SLIP, np.flatnonzero(used if used.any() else span))
+    doubt = doubt_of(given.graph, used if used.any() else span, SLIP)
     return replace(doubt, first=int(given.low[step]), last=int(given.high[step]))

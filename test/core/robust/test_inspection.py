@@ -17,10 +17,9 @@ from problems import add_absolute, retold
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
-from l1slam_ros.core.graph.parts import odometry_gaps
+from l1slam_ros.core.graph.parts import connected_parts, odometry_gaps
 from l1slam_ros.core.robust.inspection import (
     _system,
-    connected_parts,
     cost_at,
     long_steps,
     noise_scales,

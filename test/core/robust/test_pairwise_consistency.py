@@ -42,10 +42,10 @@ def grown(graph):
 def test_loops_across_a_slip_agree(bad):
     growth = grown(slipped(bad.graph, STEP, TURN))
     group = strongest_group(growth, growth.undecided())
-    assert len(group.places) >= FEWEST_PLACES
-    assert not is_false(bad, growth.given.factors)[group.rows].any()
-    assert ((growth.given.low[group.rows] <= STEP) & (growth.given.high[group.rows] > STEP)).all()
-    steps = growth.given.low[common_steps(growth, group.rows)]
+    assert growth.given.count_places(group) >= FEWEST_PLACES
+    assert not is_false(bad, growth.given.factors)[group].any()
+    assert ((growth.given.low[group] <= STEP) & (growth.given.high[group] > STEP)).all()
+    steps = growth.given.low[common_steps(growth, group)]
     assert steps.min() <= STEP <= steps.max()
 
 
@@ -57,7 +57,7 @@ def test_false_loops_agree_by_chance_at_most(kind):
 def test_where_nothing_is_refused_nobody_agrees():
     growth = grown(careful_world(60, 100).graph)
     growth.accepted[:] = True
-    assert not len(strongest_group(growth, growth.undecided()).rows)
+    assert not len(strongest_group(growth, growth.undecided()))
 
 
 def test_spanned_counts_the_factors_across_each_step():

@@ -21,49 +21,25 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
 from l1slam_ros.core.graph.spanning_tree import pair_key, parents
 from l1slam_ros.core.robust.innovation import claimed_volume
-from l1slam_ros.core.robust.odometry.motion import (
-    Motion,
-    log_odds_of_slips,
-    steps_of,
-    unwhitening,
-)
+from l1slam_ros.core.robust.odometry.motion import Motion, log_odds_of_slips, steps_of, unwhitening
 from l1slam_ros.core.robust.odometry.untold import log_slip
-from l1slam_ros.core.robust.pairwise_consistency import (
-    Group,
-    by_pair_of_parts,
-    longest_run,
-    spanned,
-    strongest_across,
-)
-from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
+from l1slam_ros.core.robust.pairwise_consistency import spanned, strongest_across
 from l1slam_ros.core.robust.rounds.growth import Growth
 
 
-def join(growth: Growth, by_runs: bool = False) -> bool:
-    """
-    Move parts to where loops across agree that they are; return whether any was.
-
-    by_runs : where loops of two places do not, those of one that is long may
-    """
+def join(growth: Growth) -> bool:
+    """Move parts to where loops across agree that they are; return whether any was."""
     joined = False
-    while (rows := growth.joining()).size:
-        group = strongest_across(growth)
-        if len(group.places) < TWO_PLACES and by_runs:
-            group = max((longest_run(growth, some) for some in by_pair_of_parts(growth, rows)),
-                        key=lambda group: len(group.rows))
-        elif len(group.places) < TWO_PLACES:
-            return joined
-        if not len(group.rows):
-            return joined
+    while len(group := strongest_across(growth)):
         _join_by(growth, group)
         joined = True
     return joined
 
 
-def _join_by(growth: Growth, group: Group) -> None:
+def _join_by(growth: Growth, group: Indices) -> None:
     """Move the later one of two parts to where the first loop of a group says, accept all."""
     given = growth.given
-    manifold, loop = given.graph.manifold, group.rows[0]
+    manifold, loop = given.graph.manifold, group[0]
     fixed, moving = given.low[loop], given.high[loop]
     Z = given.factors.measurement[loop, None]
     if growth.part[fixed] > growth.part[moving]:
@@ -74,7 +50,7 @@ def _join_by(growth: Growth, group: Group) -> None:
     growth.poses = growth.poses.copy()
     growth.poses[part] = manifold.compose(
         np.broadcast_to(motion, growth.poses[part].shape), growth.poses[part])
-    growth.accepted[group.rows] = True
+    growth.accepted[group] = True
     growth.solve()
 
 
@@ -94,7 +70,7 @@ def without(growth: Growth, step: int) -> Growth | None:
         state.solve()
     else:  # each side stays as it is
         state.label_parts()
-    if not join(state, by_runs=True) or state.across()[step]:
+    if not join(state) or state.across()[step]:
         if told:
             kept.solve()
         if not told or kept.across()[step]:
@@ -122,8 +98,8 @@ def as_shown(growth: Growth, steps: list[int], loops: list[int]) -> Growth | Non
             state.accepted[span] = given.trusted[span]
             state.label_parts()
         if state.across()[loop]:
-            _join_by(state, Group(np.array([loop]), given.place[[loop]]))
-    join(state, by_runs=True)
+            _join_by(state, np.array([loop]))
+    join(state)
     if (state.across() & state.cut & ~given.gap).any():
         return None
     state.accept_more()

@@ -110,16 +110,16 @@ class Straight:
     @cached_property
     def stretches(self) -> float:
         """Along how many stretches more than places loops are."""
-        given = self.told.given
-        one, other = given.mates
-        loops = np.zeros(len(given.factors), bool)
-        loops[self.loops] = True
-        near = np.bincount(one, loops[other], len(loops))[self.loops]
+        one, other = self.told.given.mates
+        loops = np.isin(np.arange(len(self.told.accepted)), self.loops)
+        near = np.bincount(one, loops[other], len(loops))[loops]
         return float((1 / (1 + near)).sum()) - len(self._one_each)
 
     def keeps_places(self, as_stated: Growth) -> bool:
         """Return whether loops of as many places are accepted as without."""
-        return _places(as_stated, self.told) >= _places(as_stated, as_stated)
+        now, before = (as_stated.given.count_places(state.loops)
+                       for state in (self.told, as_stated))
+        return now >= before
 
     @cached_property
     def _one_each(self) -> Indices:
@@ -128,8 +128,8 @@ class Straight:
 
     @cached_property
     def loops(self) -> Indices:
-        """The loops that are accepted, (k,)."""
-        return np.asarray(np.flatnonzero(self.told.accepted & self.told.given.is_loop))
+        """The loops that were accepted before the tail of the noise, (k,)."""
+        return np.asarray(np.flatnonzero(self.told.loops))
 
 
 def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
@@ -156,7 +156,7 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
     fitting = values + fits - count * fits[first] / max(count[first], 1)
     if stated:
         noise = np.array([straight.told.noise.variance[0] for straight in some])
-        alone = len(np.unique(some[0].told.given.place[some[0].loops])) < TWO_PLACES
+        alone = some[0].told.given.count_places(some[0].loops) < TWO_PLACES
         fitting[(alone & (values < values[0])) | (noise > noise[0])] = -np.inf
         fitting[0] += sure
         values, first = fitting, int(np.argmax(fitting))
@@ -168,11 +168,6 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
     if not first or not rivals:
         return some[first], 0.0, np.inf
     return some[first], min(rivals)[1], -float(np.logaddexp.reduce([-less for less, _ in rivals]))
-
-
-def _places(known: Growth, growth: Growth) -> int:
-    """Return of how many places, as one state knows them, the loops are that another accepts."""
-    return len(np.unique(known.given.place[growth.accepted & growth.given.is_loop]))
 
 
 def _log_likelihood(growth: Growth, loops: Indices) -> float:

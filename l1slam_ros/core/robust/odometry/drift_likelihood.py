@@ -28,9 +28,6 @@ and loops of two laps share most of their errors, which is not counted here: `dr
 Source: ours, by the recorded logs that `test_drift.py` names where they are.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 
 from l1slam_ros.core import kernels
@@ -74,7 +71,7 @@ def likely_drifts(graph: FactorGraph) -> Array:
     if graph.manifold is not se2 or not len(rows):
         return np.zeros(0)
     rows = rows[:: max(1, len(rows) // ASKED)]
-    likelihood = _drift_likelihood(bridged(graph), rows)
+    likelihood = _DriftLikelihood(bridged(graph), rows)
     drifts = likelihood.peaks()
     values = np.array([likelihood.value(drift, USUAL**2) for drift in drifts])
     most = values.max()
@@ -83,25 +80,6 @@ def likely_drifts(graph: FactorGraph) -> Array:
     order = np.argsort(-values, kind='stable')
     near: Array = drifts[order[values[order] >= _ANOTHER * most]][:_TRIED]
     return near
-
-
-def _drift_likelihood(graph: FactorGraph, rows: Indices) -> '_DriftLikelihood':
-    """Return what some loops, (k,), of a graph without gaps say of its odometry."""
-    chain = odometry_poses(graph)
-    low, high, measured = ends_in_time(graph)
-    factors = graph.between
-    steps = np.flatnonzero(factors.is_odometry)
-    covariance = covariance_of(factors.sqrt_information)
-    way, noise = np.zeros(graph.n_poses), np.zeros((graph.n_poses, 2))
-    at = np.minimum(factors.i, factors.j)[steps] + 1
-    way[at] = np.hypot(*factors.measurement[steps, :2].T)
-    noise[at] = np.stack((np.trace(covariance[steps, :2, :2], axis1=1, axis2=2) / 2,
-                          covariance[steps, 2, 2]), axis=1)
-    way = np.cumsum(way)
-    place, ends = places(graph, chain)
-    return _DriftLikelihood(
-        chain, way, noise, low[rows], high[rows], measured[rows], covariance[rows],
-        _weights(place[rows], ends[rows]), noise[:, 1].sum() / max(way[-1], TINY) ** 2)
 
 
 def _weights(place: Indices, ends: Array) -> Array:
@@ -119,26 +97,36 @@ def _weights(place: Indices, ends: Array) -> Array:
     return weight
 
 
-@dataclass(frozen=True)
 class _DriftLikelihood:
     """
-    How likely drifts of the odometry are, by k loops.
+    How likely drifts of the odometry are, by k loops of a graph without gaps.
 
     chain : (n, 3) poses along the odometry; way : (n,) metres to each; noise : (n, 2) variance of
     the position and of the heading of the step to each, as stated; low, high : (k,) the ends of
     each loop; measured : (k, 3) by it; own : (k, 3, 3) its covariance; weight : (k,) of each;
-    walk : the variance of a drift that is but noise.
+    metres, turns, lack : (k,) the way between its ends, the variance of turns on it, and what
+    these lack; walk : the variance of a drift that is but noise.
     """
 
-    chain: Array
-    way: Array
-    noise: Array
-    low: Indices
-    high: Indices
-    measured: Array
-    own: Array
-    weight: Array
-    walk: float
+    def __init__(self, graph: FactorGraph, rows: Indices):
+        chain = self.chain = odometry_poses(graph)
+        low, high, measured = ends_in_time(graph)
+        low, high, measured = low[rows], high[rows], measured[rows]
+        factors = graph.between
+        steps = np.flatnonzero(factors.is_odometry)
+        covariance = covariance_of(factors.sqrt_information)
+        way, noise = np.zeros(graph.n_poses), np.zeros((graph.n_poses, 2))
+        at = np.minimum(factors.i, factors.j)[steps] + 1
+        way[at] = np.hypot(*factors.measurement[steps, :2].T)
+        noise[at] = np.stack((np.trace(covariance[steps, :2, :2], axis1=1, axis2=2) / 2,
+                              covariance[steps, 2, 2]), axis=1)
+        way, turns = np.cumsum(way), np.cumsum(noise[:, 1])
+        place, ends = places(graph, chain)
+        self.weight = _weights(place[rows], ends[rows])
+        self.way, self.noise, self.walk = way, noise, turns[-1] / max(way[-1], TINY) ** 2
+        self.low, self.high, self.measured, self.own = low, high, measured, covariance[rows]
+        self.metres, self.turns = way[high] - way[low], turns[high] - turns[low]
+        self.lack = measured[:, 2] - (chain[high, 2] - chain[low, 2])
 
     def peaks(self) -> Array:
         """Return the drifts, (p,), near which most of the headings agree, likeliest first."""
@@ -153,20 +141,11 @@ class _DriftLikelihood:
     def _refined(self, drift: float, q: float) -> float:
         """Return where the peak near a drift is, as finely as the longest loop tells."""
         step = _STEP
-        metres = float(self._headings[0].max())
-        while step * metres > _FINE:
+        while step * self.metres.max() > _FINE:
             step /= 2
             near = drift + step * np.linspace(-2, 2, 5)
             drift = float(near[np.argmax(self._by_headings(near, step, np.array([q]))[0])])
         return drift
-
-    @cached_property
-    def _headings(self) -> tuple[Array, Array, Array]:
-        """Return the ways [m], the variances of turns, and what these lack, of loops, (k,)."""
-        low, high = self.low, self.high
-        turns = np.cumsum(self.noise[:, 1])
-        lack = self.measured[:, 2] - (self.chain[high, 2] - self.chain[low, 2])
-        return self.way[high] - self.way[low], turns[high] - turns[low], lack
 
     def _by_headings(self, drift: Array, step: float, noise: Array) -> Array:
         """
@@ -174,12 +153,11 @@ class _DriftLikelihood:
 
         drift : (d,); noise : (q,) what the odometry states of its turns is off by, in variance
         """
-        metres, turns, lack = self._headings
         # Single precision tells peaks apart, and takes half the time.
-        square = (se2.wrap(lack - drift[:, None] * metres) ** 2 / 2).astype(np.float32)
+        square = (se2.wrap(self.lack - drift[:, None] * self.metres) ** 2 / 2).astype(np.float32)
         values = []
         for q in noise.tolist():
-            variance = self.own[:, 2, 2] + q * turns + (metres * step) ** 2 / 12
+            variance = self.own[:, 2, 2] + q * self.turns + (self.metres * step) ** 2 / 12
             even = np.where(variance > np.pi**2 / 3, 1.0, 0.0)
             ratio = np.exp(square * (-1 / variance).astype(np.float32))
             # A lie's turn has the density 1 / (2 pi).

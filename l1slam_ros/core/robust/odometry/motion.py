@@ -20,15 +20,9 @@ import numpy as np
 
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.robust.gating import TINY
-from l1slam_ros.core.robust.innovation import (
-    claimed_volume,
-    log_likelihood_ratio,
-)
+from l1slam_ros.core.robust.gating import SAME, TINY
+from l1slam_ros.core.robust.innovation import claimed_volume, log_likelihood_ratio
 from l1slam_ros.core.robust.rounds.growth import Growth
-
-# Motions are told apart to this part of what they are.
-_GRAIN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -87,7 +81,7 @@ def steps_of(growth: Growth, rows: Indices) -> Array:
 def usual_motion(growth: Growth) -> Motion:
     """Return how the robot moves by its odometry."""
     step = steps_of(growth, np.flatnonzero(~growth.given.is_loop & ~growth.cut))
-    least = np.diag(_GRAIN**2 * (step**2).mean(axis=0) + TINY)
+    least = np.diag(SAME**2 * (step**2).mean(axis=0) + TINY)
     translation = growth.given.graph.manifold.TRANSLATION
     width = np.full(len(least), np.pi**2 / 3)
     width[translation] = (step[:, translation] ** 2).mean()

@@ -33,7 +33,7 @@ def with_runs(growth: Growth) -> Growth | None:
     by no more than that, of whose place nothing is accepted, is rather true than a lie.
     """
     given, noise = growth.given, growth.noise
-    rows, loops = growth.undecided(), growth.accepted & given.is_loop
+    rows, loops = growth.undecided(), growth.loops
     rows = rows[~np.isin(given.place[rows], given.place[loops])]
     most = np.unique(given.place[rows], return_counts=True)[1].max(initial=0)
     if most < RUN or growth.ventured.any() or (
@@ -48,7 +48,7 @@ def with_runs(growth: Growth) -> Growth | None:
         return None
     state = growth.copy()
     for group in groups:
-        state.accepted[group.rows] = state.ventured[group.rows] = True
+        state.accepted[group] = state.ventured[group] = True
     state.noise = replace(noise, variance=noisier.noise.variance)
     state.drops[:] = 0
     state.learn_noise_anew()
@@ -67,7 +67,6 @@ def _noisier_costs(growth: Growth, noisier: Growth) -> float:
     the other half of the loops.
     """
     given = growth.given
-    places = len(np.unique(given.place[growth.accepted & given.is_loop]))
-    squares = places * given.graph.manifold.TANGENT_SIZE / 2
+    squares = given.count_places(growth.loops) * given.graph.manifold.TANGENT_SIZE / 2
     ratio = noisier.noise.variance[0] / growth.noise.variance[0]
     return float(squares / 2 * np.log(ratio))

@@ -88,12 +88,15 @@ class Evidence:
         """What the loops of a place are worth, ln of odds: half a gate."""
         return float(self.gate(np.array([self.graph.manifold.TANGENT_SIZE]))[0] / 2)
 
+    def count_places(self, loops: Indices | Mask) -> int:
+        """Return of how many places some loops are."""
+        return len(np.unique(self.place[loops]))
+
     def may_err_as_one(self, loops: Indices, fewest: int = FEWEST_PLACES) -> bool:
         """Return whether loops are of fewer places, none of which joins much of the way."""
         place = self.place[loops]
-        numbers = np.unique(place)
-        each = (loops[place == number] for number in numbers)
-        return len(numbers) < fewest and all(
+        each = (loops[place == number] for number in np.unique(place))
+        return self.count_places(loops) < fewest and all(
             np.ptp(self.low[own]) + np.ptp(self.high[own]) < _SMALL * self.graph.n_poses
             for own in each)
 

@@ -23,8 +23,9 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.robust.gating import DOUBT, believable, noise_variance
+from l1slam_ros.core.robust.gating import DOUBT, TINY, believable, noise_variance
 from l1slam_ros.core.robust.innovation import (
+    BY_CHANCE,
     CHECKED,
     LEAST_RATIO,
     Innovations,
@@ -41,21 +42,12 @@ from l1slam_ros.core.robust.rounds.noise import Noise
 from l1slam_ros.core.solvers.block_cholesky import with_pattern
 from l1slam_ros.core.solvers.gauss_newton import ChangingOrder, l2_optimum
 
-# At most one in so many accepted true loops is dropped for its noise alone; of 89 runs half and
-# double change none.
-_DROPPED = 2e-5
 # A loop that was dropped that often is not tried again; half and double make none of 89 worse.
 _CHANCES = 2
-# The tail of the noise ends no further off than so many times what nearly all stay below, in
-# squares.
-_TAIL = 2.0
 # So often noise is learnt anew of other factors: each time half of what it was before may stay.
 _LEARNT_ANEW = 8
 # While driving so many of the last absolute factors are looked at, with their neighbours.
 _LATEST = 50
-# The variance of an odometry factor that was cut, in units of its own: loops alone decide, and far
-# loops know of a step to some hundred sigmas.
-_CUT = 1e8
 
 
 class Growth:
@@ -111,10 +103,15 @@ class Growth:
         self._tie_to_world(_LATEST)
         # What the noise of these is, is known.
         self.noise = replace(self.noise, learnt_of=self.accepted.copy())
-        if (self.accepted & self.given.is_loop).any():
+        if self.loops.any():
             self.solve()
         else:
             self.begin()
+
+    @property
+    def loops(self) -> Mask:
+        """(m,) bool: the loops that are accepted."""
+        return self.accepted & self.given.is_loop
 
     @property
     def may_be_predicted(self) -> Mask:
@@ -169,10 +166,10 @@ class Growth:
         variance = np.where(self.given.factors.is_absolute[rows], 1.0,
                             self.noise.assumed[self.given.is_loop[rows].astype(np.int64)])
         cut = self.cut[rows]
-        # Where loops hold both sides, the odometry between them hardly matters; where nothing
-        # does, it is all there is. Either way it says that the keyframes are where they are.
+        # Where loops hold both sides, they alone decide, be it to some hundred sigmas; where
+        # nothing does, it is all there is. Either way the keyframes are where they are.
         low, high = self.given.factors.i[rows[cut]], self.given.factors.j[rows[cut]]
-        variance[cut] *= np.where(self.part[low] == self.part[high], _CUT, 1.0)
+        variance[cut] *= np.where(self.part[low] == self.part[high], 1 / TINY, 1.0)
         subgraph = self.given.graph.subset(rows, variance)
         subgraph.between.measurement[cut] = self.given.graph.manifold.between(
             self.poses[low], self.poses[high])
@@ -219,7 +216,8 @@ class Growth:
 
         They are the tail of the noise, or lies that are not far off. Lies of a corridor are off by
         anything along it: that the n nearest ones, those beside others not counted, are within
-        the part c of how far the next one is off, has the probability c^n.
+        the part c of how far the next one is off, has the probability c^n. Nor is it further off
+        than one in a hundred of those that the gate refuses.
         """
         given = self.given
         rows = np.flatnonzero(~self.fits_found & ~self.accepted)
@@ -231,8 +229,8 @@ class Growth:
         one, other = given.mates
         count = np.cumsum(~np.isin(rows[order], one[rank[other] < rank[one]]))
         apart = np.diff(np.log(off[order]), append=np.inf) / 2 * count > np.log(1 / DOUBT)
-        end = np.flatnonzero(apart & (off[order] < _TAIL)).max(initial=-1)
-        tail = rows[order[:end + 1]]
+        apart &= (found.square < given.gate(found.freedom, BY_CHANCE * DOUBT))[order]
+        tail = rows[order[:np.flatnonzero(apart).max(initial=-1) + 1]]
         if len(tail):
             self.fits_found[tail] = True
             self.accept_more()
@@ -288,7 +286,7 @@ class Growth:
         """Return the accepted loops that do not fit, or that all others speak against."""
         freedom = self.given.factors.freedom[rows]
         may_go = self.given.is_loop[rows] & ~self.given.trusted[rows]
-        far = (residual**2).sum(axis=1) > chi2_quantile(1 - _DROPPED, freedom)
+        far = (residual**2).sum(axis=1) > self.given.gate(freedom)
         against = np.where(may_go, self.posterior.left_out(), 0.0)
         # Next to a false loop the true ones look bad too: only the worst go.
         doubted = self.given.gate(freedom, DOUBT / len(rows))
@@ -325,25 +323,24 @@ class Growth:
         """Return which of some loops may be accepted: each by itself, or else together, (k,)."""
         if not len(rows):
             return rows
-        found, loops = self.innovations(rows), self.accepted & self.given.is_loop
+        found = self.innovations(rows)
         fits = (found.square < self.given.gate(found.freedom)) & self.fits_found[rows]
         refused = self.given.is_loop & ~self.accepted
         refused[rows[fits]] = False
         # Taken at their word, or by the noise that one run taught, all are noisier than they are,
         # so that more fit by chance: then only the rest says how many of the rest are false.
         true = (0 if self.noise.at_their_word or self.ventured.any()
-                else np.count_nonzero(loops))
+                else np.count_nonzero(self.loops))
         return np.asarray(rows[believable(
             found, self.posterior, self.given.gate, fits, int(true), self.given.place[rows],
-            beside_refused(self.given.mates, refused, loops)[rows])])
+            beside_refused(self.given.mates, refused, self.loops)[rows])])
 
 
 def gain_of_places(growth: Growth, as_stated: Growth, cut: Growth) -> float:
     """Return what the places say that are won and lost by a cut, ln of odds."""
-    place, is_loop = growth.given.place, growth.given.is_loop
-    before, explained, after = (np.unique(place[state.accepted & is_loop])
+    before, explained, after = (np.unique(growth.given.place[state.loops])
                                 for state in (growth, as_stated, cut))
     won = len(np.setdiff1d(after, np.union1d(before, explained)))
     # Of a place that is long, too, what is lost had to be a mistake.
-    lost = len(np.unique(place[growth.accepted & ~cut.accepted & is_loop]))
+    lost = growth.given.count_places(growth.loops & ~cut.loops)
     return growth.given.log_odds_of_place * (won - lost)
