@@ -161,8 +161,8 @@ def test_a_bar_is_passed_by_the_right_map_and_by_doubt_where_doubt_is_an_answer(
     assert run_of(place, 'random', 0.5, told).passed
     assert not run_of(place, 'random', 0.5, lambda case: told(case, solvers.DOUBTFUL)).passed
     assert run_of(place, 'random', 0.7, lambda case: told(case, solvers.DOUBTFUL)).passed
-    assert not run_of(place, 'ring', 0.0, told).passed
-    assert run_of(place, 'ring', 0.0, lambda case: told(case, solvers.DOUBTFUL)).passed
+    assert not run_of(place, 'ring-random', 0.5, told).passed
+    assert run_of(place, 'ring-random', 0.5, lambda case: told(case, solvers.DOUBTFUL)).passed
     named = run_of(place, 'clean', 0.0, lambda case: told(case, slips=(7,)))
     assert named.wrongly == 1 and not named.passed
 

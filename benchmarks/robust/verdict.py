@@ -139,8 +139,8 @@ _DRAWN: dict[str, Callable[[np.random.Generator], Place]] = {
     'rings': lambda rng: _ring(int(rng.integers(10**6)), rng.random() < 0.3),
     'corridors': lambda rng: _corridor(int(rng.integers(10**6)), rng.random() < 0.3)}
 FITTED = 1
-_LOOKED_AT = 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13
-_NEVER_SEEN = 14
+_LOOKED_AT = 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14
+_NEVER_SEEN = 15
 
 
 def runs_drawn(base: int, count: int) -> Iterator[Row]:

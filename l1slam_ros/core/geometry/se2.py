@@ -72,9 +72,6 @@ def between(a: Array, b: Array) -> Array:
 
 def retract(pose: Array, step: Array) -> Array:
     """Return pose v2t(step); a pose of SE(2) and its tangent share their coordinates."""
-    if pose.ndim == 2 and pose.shape == step.shape:
-        return kernels.se2.retract(np.ascontiguousarray(pose, float),
-                                   np.ascontiguousarray(step, float))
     return compose(pose, step)
 
 

@@ -146,9 +146,8 @@ def with_world(manifold: Manifold, poses: Array) -> Array:
 def ends(graph: FactorGraph, poses: Array) -> tuple[Array, Array]:
     """Return the poses of the ends i and j of each between factor, (m, p) each."""
     factors = graph.between
-    of_i, of_j = kernels.blocks.ends(
-        np.ascontiguousarray(poses), graph.manifold.identity(1), factors.i, factors.j)
-    return of_i, of_j
+    poses = with_world(graph.manifold, poses)
+    return poses.take(factors.i, axis=0), poses.take(factors.j, axis=0)
 
 
 def whitened_residual(graph: FactorGraph, poses: Array) -> Array:

@@ -14,7 +14,7 @@ Sums over factors of products of their two blocks with vectors.
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import ANY_SIZE, compiled, for_sizes, loop
+from l1slam_ros.core.kernels.compiled import ANY_SIZE, compiled, for_sizes
 from l1slam_ros.core.kernels.vectors.inline import Inline
 
 _FACTORS = ('f8[::1], i8[:, ::1], i8[::1], i8[::1], b1[::1], i8[::1], i8[::1], f8[:, :, :, ::1], '
@@ -23,18 +23,6 @@ _FACTORS = ('f8[::1], i8[:, ::1], i8[::1], i8[::1], b1[::1], i8[::1], i8[::1], f
 _IN_SPACE = 6
 # Factors whose blocks are fetched at the same time.
 _AHEAD = 16
-
-
-@loop('(f8[:, ::1], f8[:, ::1], i8[::1], i8[::1])')
-def ends(poses, world, i, j):
-    """Return rows i and rows j of poses, (m, p) each; negative: that of the world, (1, p)."""
-    m, p = len(i), poses.shape[1]
-    of_i, of_j = np.empty((m, p)), np.empty((m, p))
-    for f in range(m):
-        for c in range(p):
-            of_i[f, c] = poses[i[f], c] if i[f] >= 0 else world[0, c]
-            of_j[f, c] = poses[j[f], c] if j[f] >= 0 else world[0, c]
-    return of_i, of_j
 
 
 @for_sizes('i8[:, ::1], f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1]', ANY_SIZE)

@@ -93,18 +93,6 @@ def residual(z, x_i, x_j):
     return e
 
 
-@loop('(f8[:, ::1], f8[:, ::1])', brief=True)
-def retract(poses, steps):
-    """Return poses v2t(step), (n, 3)."""
-    moved = np.empty_like(poses)
-    c, s = _turns(poses)
-    for k in range(len(poses)):
-        moved[k, 0] = poses[k, 0] + (c[k] * steps[k, 0] - s[k] * steps[k, 1])
-        moved[k, 1] = poses[k, 1] + (s[k] * steps[k, 0] + c[k] * steps[k, 1])
-        moved[k, 2] = _wrapped(poses[k, 2] + steps[k, 2])
-    return moved
-
-
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1])')
 def jacobians(z, x_i, x_j):
     """Return J_e_i and J_e_j, (m, 2, 3, 3)."""
