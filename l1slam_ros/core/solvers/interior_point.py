@@ -48,6 +48,8 @@ from l1slam_ros.core.solvers.optimality import Status, fits_exactly, l1_cost, sm
 _FRACTION = 0.9995
 # A step that the bounds cut to less is followed by a centring step, which only leaves the bounds.
 _SHORT = 0.1
+# One that goes further is not corrected once more: on 113 drawn graphs that saved nothing.
+_FAR = 0.9
 # Slacks are kept above this and never recomputed as 1 -+ y, which would cancel.
 _SMALLEST_SLACK = 1e-15
 # A step is shortened while the residual departs from its linearisation by more than this part of
@@ -242,7 +244,8 @@ def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, gap: float) -> _
     most = mean if len(at.y) > _MANY_ROWS else np.inf
     *rhs, pull = kernels.interior_point.aim_combined(*state, affine.y, mu, most)
     combined = _solve_kkt(state, at, cholesky, (rhs[0], rhs[1]), pull)
-    if not at.is_torn:  # else bends hold a step back rather than bounds
+    # Else nothing is to be won, or bends hold a step back rather than bounds.
+    if combined.reach < _FAR and not at.is_torn:
         # Gondzio's.
         *rhs, pull = kernels.interior_point.aim_centrally(
             *state, combined.y, *combined.products, _ALIKE * mu, mu / _ALIKE)
