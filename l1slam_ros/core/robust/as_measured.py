@@ -29,10 +29,9 @@ from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.places import first_told
 from l1slam_ros.core.robust.rounds.growth import Growth
 
-# Noise of odometry in units of what it states, in variance: with less than the first nobody meant
-# that, and it is taken for as much as the second. For what was found, loops with more than normal
-# errors would be lost.
-_OVERSTATED, _TAKEN = 0.02, 0.1
+# Noise of odometry in units of what it states, in variance: with less nobody meant that, and it is
+# taken for that much. For what was found, loops with more than normal errors would be lost.
+_OVERSTATED = 0.1
 # [rad^2/m^2] Where a file says of a radian what it says of a metre, its variance is taken for so
 # many times that of a metre until it was found: a tenth to a hundredth is usual.
 _TURN = 1 / 30
@@ -83,7 +82,7 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
             judgement.variance[0] > _OVERSTATED or judgement.accepted.all()):
         return judgement, poses
     try:
-        meant *= (judgement.variance[0] / _TAKEN if first is graph
+        meant *= (judgement.variance[0] / _OVERSTATED if first is graph
                   else _by_number(first, judgement, poses))
     except FAILURES as error:
         return judgement.broken_off(graph, error), poses
