@@ -23,6 +23,7 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.innovation import BY_CHANCE, student_quantile
 from l1slam_ros.core.robust.inspection import FEWEST
 from l1slam_ros.core.robust.judgement import Judgement, weighed
 from l1slam_ros.core.robust.odometry.drift import straightened
@@ -79,7 +80,8 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
     first = weighed(graph, meant)
     judgement, poses = judge(first, report, check, known)
     if has_absolute or first is graph and (
-            judgement.variance[0] > _OVERSTATED or judgement.accepted.all()):
+            judgement.variance[0] > _OVERSTATED or judgement.accepted.all()
+            or _stays(graph, judgement)):
         return judgement, poses
     try:
         meant *= (judgement.variance[0] / _OVERSTATED if first is graph
@@ -90,6 +92,18 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
     # What odometry states stays as large, so that the next of it is worth as much.
     times = np.exp(np.log(meant).mean(axis=1))
     return replace(judgement, variance=judgement.variance * times, meant=meant / times[0]), poses
+
+
+def _stays(graph: FactorGraph, judgement: Judgement) -> bool:
+    """
+    Return whether just what is accepted fits by the noise found, too, without a doubt.
+
+    No, too, where that cannot be told: sigmas are of no more than some hundred times this noise.
+    """
+    factors = graph.between
+    gate = student_quantile(1 - BY_CHANCE, factors.freedom, graph.manifold.TANGENT_SIZE)
+    fits = factors.is_odometry | (judgement.sigmas**2 < judgement.variance[0] * gate)
+    return not judgement.doubts and bool((fits == judgement.accepted).all())
 
 
 def states_identity(graph: FactorGraph) -> Mask:

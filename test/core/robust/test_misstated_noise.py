@@ -79,6 +79,19 @@ def test_of_noise_stated_far_too_large_the_tails_are_not_taken_for_lies():
     assert np.count_nonzero(~found.accepted & ~lies) <= 4
 
 
+@pytest.mark.parametrize('times, judged', [(2.0, 1), (6.0, 1), (1e3, 2)])
+def test_overstated_noise_is_judged_once_more_only_where_loops_may_fit_by_it(times, judged):
+    bad = spoilt(careful_world(300, 420), 'random', 100)
+    first = []
+
+    def report(number, accepted):
+        first.append(number == 1)
+
+    found, _ = robust_solve(retold(bad.graph, times=times), report)
+    assert sum(first) == judged
+    np.testing.assert_array_equal(found.accepted, ~is_false(bad, bad.graph.between))
+
+
 def test_what_is_stated_is_the_median_by_determinant():
     graph = graph_of(straight(5), [(0, 1), (1, 2), (2, 3), (3, 4), (0, 2), (1, 4)])
     variance = np.array([[1.0, 4.0, 16.0]] * 5 + [[1e4, 1e4, 1e4]])
