@@ -133,7 +133,7 @@ MADE: dict[str, Callable[[int], Place]] = {
 
 
 # Kinds of drawn worlds. The first number of a seed is that of its set: weights are fitted on the
-# first, the others are fresh. Rules were made with a look at the second to the ninth.
+# first, the others are fresh. Rules were made with a look at the second to the twelfth.
 _DRAWN: dict[str, Callable[[np.random.Generator], Place]] = {
     'streets': drawn.streets, 'laps': drawn.laps, 'spokes': drawn.spokes, 'lawn': drawn.lawn,
     'rings': lambda rng: _ring(int(rng.integers(10**6)), rng.random() < 0.3),

@@ -75,16 +75,15 @@ class Judgement:
     accepted, suspect : (m,) bool, suspect is a loop that fits but could as well be chance, a loop
     that is neither is rejected; sigmas : (m,) how far off each factor is, in units of its noise,
     as stated or larger if it was found so, less than stated where that is far too much, see
-    `as_measured`: the length of the residual, and where it is not
-    accepted, of that over the uncertainty of the map, NaN before a loop was looked at; variance :
-    (2,) of odometry and of loops as it was found, in units of what they state; noise : (m,) that
-    of each in a map, in the same units; slips : (k,) the odometry factors that slipped, not
-    accepted; doubts : reasons not to rely on the map; settled : no more is to be found out from
-    the factors that are there; drift : by how much more each metre of the odometry turns than it
-    says [rad/m]; confidence : see `forecast`, NaN where nothing is recorded of such maps; terms :
-    what that was made of, see `forecast`;
-    is_refusal_doubted : refused loops may be true; meant : (2, k) the variance of each number of
-    odometry and of loops, where nobody stated it, in units of what is stated.
+    `as_measured`: the length of the residual, and where it is not accepted, of that over the
+    uncertainty of the map, NaN before a loop was looked at; variance : (2,) of odometry and of
+    loops as it was found, in units of what they state; noise : (m,) that of each in a map, in the
+    same units; slips : (k,) the odometry factors that slipped, not accepted; doubts : reasons not
+    to rely on the map; settled : no more is to be found out from the factors that are there; drift
+    : by how much more each metre of the odometry turns than it says [rad/m]; confidence : see
+    `forecast`, NaN where nothing is recorded of such maps; terms : what that was made of, see
+    `forecast`; is_refusal_doubted : refused loops may be true; meant : (2, k) the variance of each
+    number of odometry and of loops, where nobody stated it, in units of what is stated.
     """
 
     accepted: Mask

@@ -38,7 +38,6 @@ _NEAREST = 20
 # A run has so many loops, and each agrees with half as many others of it.
 RUN = 6
 
-
 NONE: Indices = np.zeros(0, np.int64)
 
 

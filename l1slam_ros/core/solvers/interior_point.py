@@ -185,7 +185,8 @@ def interior_point(
     """
     at = _start(problem, poses)
     costs = [l1_cost(at.residual)]
-    best = replace(at)
+    # A step writes into u, v, s, t, y; poses and system it makes anew.
+    best = at.poses, at.system
     curvature = Curvature()
     status = Status.ITERATION_LIMIT
     worst = 1 + tolerance
@@ -196,7 +197,7 @@ def interior_point(
         if (gap <= small and apart <= small) or fits_exactly(cost, len(at.y)):
             status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
         if cost <= costs[-1]:
-            best = replace(at)
+            best = at.poses, at.system
         if iteration:
             costs.append(min(cost, costs[-1]))
             report(iteration, costs[-1])
@@ -205,7 +206,8 @@ def interior_point(
         if not _step(problem, at, cholesky, curvature):
             status = Status.STALLED
             break
-    return Optimum(best.poses, costs, status, replace(at, system=best.system))
+    poses, system = best
+    return Optimum(poses, costs, status, replace(at, system=system))
 
 
 def _start(problem: L1Problem, poses: Array) -> _Iterate:
@@ -242,14 +244,14 @@ def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, gap: float) -> _
     mu = mean * (affine.gap / gap) ** 3
     # Mehrotra's corrector.
     most = mean if len(at.y) > _MANY_ROWS else np.inf
-    *rhs, pull = kernels.interior_point.aim_combined(*state, affine.y, mu, most)
-    combined = _solve_kkt(state, at, cholesky, (rhs[0], rhs[1]), pull)
+    c1, c2, pull = kernels.interior_point.aim_combined(*state, affine.y, mu, most)
+    combined = _solve_kkt(state, at, cholesky, (c1, c2), pull)
     # Else nothing is to be won, or bends hold a step back rather than bounds.
     if combined.reach < _FAR and not at.is_torn:
         # Gondzio's.
-        *rhs, pull = kernels.interior_point.aim_centrally(
-            *state, combined.y, *combined.products, _ALIKE * mu, mu / _ALIKE)
-        corrected = _solve_kkt(state, at, cholesky, (rhs[0], rhs[1]), pull)
+        c1, c2, pull = kernels.interior_point.aim_centrally(
+            *state, combined.y, c1, c2, _ALIKE * mu, mu / _ALIKE)
+        corrected = _solve_kkt(state, at, cholesky, (c1, c2), pull)
         combined = max(combined, corrected, key=lambda step: step.reach)
     if combined.reach < _SHORT:
         # Some products u s and v t are far smaller than others: first make them equal.

@@ -123,8 +123,10 @@ class _DriftLikelihood:
         way, turns = np.cumsum(way), np.cumsum(noise[:, 1])
         place, ends = places(graph, chain)
         self.weight = _weights(place[rows], ends[rows])
-        self.way, self.noise, self.walk = way, noise, turns[-1] / max(way[-1], TINY) ** 2
-        self.low, self.high, self.measured, self.own = low, high, measured, covariance[rows]
+        self.way, self.noise = way, noise
+        self.walk = turns[-1] / max(way[-1], TINY) ** 2
+        self.low, self.high = low, high
+        self.measured, self.own = measured, covariance[rows]
         self.metres, self.turns = way[high] - way[low], turns[high] - turns[low]
         self.lack = measured[:, 2] - (chain[high, 2] - chain[low, 2])
 
