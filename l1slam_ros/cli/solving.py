@@ -22,12 +22,11 @@ from l1slam_ros.cli.commands import Ending, inputs, read, read_scan_map, warn
 from l1slam_ros.cli.reference import Truth, known_false, position_error, read_truth
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.parts import part_labels
 from l1slam_ros.core.memory import free, in_gigabytes, measure_by
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
-from l1slam_ros.core.robust.judgement import PARTS, doubt_of_parts
+from l1slam_ros.core.robust.judgement import NO_WHEELS, doubt_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
@@ -88,8 +87,8 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
     measure_by(free_memory)
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome, sentences = settled(_outcome(arguments, record, asked))
-    if made:
-        outcome = _with_parts_doubted(record.graph, outcome)
+    if made and not made.has_wheels:
+        outcome = _without_wheels(record.graph, outcome)
     remarks = [*_remarks(outcome), *sentences,
                *offset_sentence(record.graph.manifold, outcome.offset)]
     warn(remarks, arguments.quiet)
@@ -126,29 +125,18 @@ def _read(arguments: argparse.Namespace) -> tuple[GraphRecord, 'ScanMap | None']
     return made.record, made
 
 
-def _with_parts_doubted(graph: FactorGraph, outcome: Outcome) -> Outcome:
-    """
-    Return the outcome of a drive past scans, doubted if its map is in several parts.
-
-    A graph may be of several sessions, which need not meet. In a drive, the place of a part that
-    no accepted loop joins is where the front end lost its way, and a guess.
-    """
-    judgement = outcome.judgement
-    if judgement is None or outcome.parts == 1:
+def _without_wheels(graph: FactorGraph, outcome: Outcome) -> Outcome:
+    """Return the outcome with the doubt of a drive of which only the scans show the motion."""
+    if outcome.judgement is None:
         return outcome
-    part = part_labels(graph.subset(judgement.accepted))
-    doubts = *judgement.doubts, doubt_of_parts(graph.between, part)
-    return replace(outcome, judgement=replace(judgement, doubts=doubts))
+    doubts = *outcome.judgement.doubts, doubt_of(graph, np.zeros(0, np.int64), NO_WHEELS)
+    return replace(outcome, judgement=replace(outcome.judgement, doubts=doubts))
 
 
 def _remarks(outcome: Outcome) -> Iterator[str]:
-    """Yield a sentence on each limit of a map: loops not judged, parts not joined."""
+    """Yield why no loop was judged, where none was."""
     if outcome.unjudged:
         yield f'no loop was doubted: {outcome.unjudged}'
-    said = outcome.judgement.doubts if outcome.judgement else ()
-    if outcome.parts > 1 and all(doubt.kind != PARTS for doubt in said):
-        yield (f'no accepted loop joins {outcome.parts:,} parts of the map, so their relative '
-               'poses are guesses')
 
 
 def _write(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,

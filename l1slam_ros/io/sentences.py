@@ -15,16 +15,18 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
-from l1slam_ros.core.robust.as_measured import states_identity
+from l1slam_ros.core.robust.as_measured import identity_roots
+from l1slam_ros.core.robust.inspection import OFF_SCALE
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
     FAILED,
+    NO_WHEELS,
     NORM,
     ONE_JOINS,
-    ONE_PLACE,
     OTHER_MAP,
     PARTS,
     SLIP,
+    UNCONFIRMED,
     UNFINISHED,
     UNSOLVED,
     WEAK,
@@ -57,33 +59,41 @@ _NOISE = (
     'between distant times',
     'the loops are about {times:.1f} times as noisy as stated: a false loop that is off by little '
     'cannot be told from noise')
+# Loops so much more accurate than stated hardly move the map, which is that of the odometry.
+_OVERSTATED = ('the loops are about {times:,.0f} times as accurate as stated: weighed as stated, '
+               'they move the map less than they could; expected covariances of what the front '
+               'end measures')
 _TOGETHER = ('the errors of loops of one place are correlated: each place counts as one loop, '
              'with the noise that was estimated')
 
 # Kind of a doubt -> its sentence.
 _REASONS = {
     WEAK: 'the map may well be {detail} m off: with the noise that was estimated, the loops that '
-          'are used allow that much; {loops} are left out, {where}',
-    ONE_PLACE: 'all {loops} loops that are used are of one place, {where}, and the odometry alone '
-               'hardly confirms them: they may be one mistake',
+          'are used allow that much; {count} are left out, {where}',
+    UNCONFIRMED: 'the odometry alone hardly confirms the {loops} in use, {where}: false ones '
+                 'could fit as well',
     ONE_JOINS: 'two parts of the map are joined only by loops of one place ({loops}, {where}), '
                'which may be one mistake',
-    OTHER_MAP: '{loops} refused loops agree with each other on another map, {where}',
-    SLIP: 'the odometry may have slipped {where}: {loops} loops across it do not decide that',
-    DRIFTS: 'the odometry may turn by about {detail} rad per metre too much, {where}: the {loops} '
-            'loops that are used do not decide that',
-    UNFINISHED: 'the judgement of the loops did not come to an end: the {loops} loops that are '
-                'left out, {where}, were still being accepted, a few at a time',
+    OTHER_MAP: '{count} refused loops agree with each other on another map, {where}',
+    SLIP: 'the odometry may have slipped {where}, undecided by {loops} across it',
+    DRIFTS: 'the odometry may turn by about {detail} rad per metre too much, {where}, undecided '
+            'by the {loops} in use',
+    UNFINISHED: 'the judgement of the loops did not come to an end: {loops} left out, '
+                '{where}, were still being accepted, a few at a time',
     NORM: 'the map differs by more than noise explains from the least squares map of the same '
-          '{loops} loops: errors are correlated, or factors are noisier than stated; `--norm l2` '
+          '{loops}: errors are correlated, or factors are noisier than stated; `--norm l2` '
           'and `--norm huber` make other maps',
+    NO_WHEELS: 'the odometry beside the scans never moves, so nothing confirms the motion where '
+               'scans do not match, {where}',
     FAILED: 'judging the loops failed ({detail}): the map is made of what was accepted until '
-            'then, and {loops} loops {where} are left out',
-    UNSOLVED: 'solving for the {loops} accepted loops failed ({detail}): this is the map by which '
+            'then, and {loops} {where} are left out',
+    UNSOLVED: 'solving with {loops} accepted failed ({detail}): this is the map by which '
               'they were judged',
     PARTS: 'no accepted loop joins {detail} parts of the map, {where}, so their relative poses '
-           'are guesses; {loops} loops between them are left out',
+           'are guesses; {loops} between them are left out',
 }
+# Of a weak map without any accepted loop.
+_NONE_ACCEPTED = 'no loop is accepted, so the map is the odometry; {loops} left out, {where}'
 _REMEDY = 'Vouch for a true loop, strike out a false one, or state the right noise'
 
 
@@ -113,6 +123,9 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     for sentence, times in zip(_NOISE, np.sqrt(judgement.variance).tolist(), strict=True):
         if times >= _NOISY:
             yield sentence.format(times=times)
+    times = math.sqrt(judgement.variance[1])
+    if accepted[is_loop].any() and 0 < times < 1 / OFF_SCALE and (judgement.meant == 1).all():
+        yield _OVERSTATED.format(times=1 / times)
     if not judgement.is_noise_stated:
         yield _TOGETHER
 
@@ -122,10 +135,9 @@ def _identity_sentences(graph: FactorGraph, judgement: Judgement) -> Iterator[st
     if (judgement.meant == 1).all():
         return
     manifold = graph.manifold
-    found = np.sqrt(judgement.meant * judgement.variance_meant[:, None])
-    for kind, stated, sigmas in zip(
-            ('odometry', 'loops'), states_identity(graph), found, strict=True):
-        if stated and np.ptp(sigmas):
+    found = np.sqrt(judgement.meant * judgement.variance_meant[:, None]) / identity_roots(graph)
+    for kind, sigmas in zip(('odometry', 'loops'), found, strict=True):
+        if np.isfinite(sigmas).all() and np.ptp(sigmas):
             yield _IDENTITY.format(
                 kind=kind, metres=sigmas[manifold.TRANSLATION][0],
                 degrees=math.degrees(sigmas[manifold.ROTATION][0]))
@@ -178,8 +190,10 @@ def doubt_reasons(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None)
         if stamps is not None:
             first, last = stamp_text(stamps[doubt.first]), stamp_text(stamps[doubt.last])
             where += f' ({first} s to {last} s)'
-        reasons.append(_REASONS[doubt.kind].format(loops=f'{doubt.loops:,}', where=where,
-                                                   detail=doubt.detail))
+        sentence = _NONE_ACCEPTED if (
+            doubt.kind == WEAK and not doubt.detail) else _REASONS[doubt.kind]
+        reasons.append(sentence.format(loops=counted(doubt.loops, 'loop'), where=where,
+                                       count=f'{doubt.loops:,}', detail=doubt.detail))
     return reasons
 
 

@@ -311,10 +311,10 @@ GAP = 'no edge between the consecutive vertices 1 and 2, so no chain of odometry
 def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys, tmp_path, start):
     path = graph_file(tmp_path, [*VERTICES, EDGES[0], EDGES[2]])
     asked = ['solve', path, '--start', start, '--json', '--output', tmp_path / 'out.g2o']
-    out, err = run(capsys, *asked, '--robust')
-    report, warning = json.loads(out), ('no accepted loop joins 2 parts of the map, so their '
-                                        'relative poses are guesses')
-    assert report['parts'] == 2 and report['warnings'] == [warning] and warning in err
+    out, err = run(capsys, *asked, '--robust', code=4)
+    report = json.loads(out)
+    assert report['parts'] == 2 and report['status'] == 'doubtful'
+    assert 'no accepted loop joins 2 parts of the map, between' in err
     assert report['suspect'] == [[0, 2]] and not report['rejected']
     out, err = run(capsys, *asked)
     warning = f'no loop was doubted: {GAP} to judge loops by'

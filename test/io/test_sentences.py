@@ -93,11 +93,15 @@ NOISY_ODOMETRY = ('the odometry is about {} times as noisy as stated: it says li
                   'between distant times')
 NOISY_LOOPS = ('the loops are about {} times as noisy as stated: a false loop that is off by '
                'little cannot be told from noise')
+ACCURATE_LOOPS = ('the loops are about {} times as accurate as stated: weighed as stated, they '
+                  'move the map less than they could; expected covariances of what the front end '
+                  'measures')
 
 
 @pytest.mark.parametrize('variance, said', [
     ((3.99, 3.99), []), ((1e-4, 0.0), []), ((4.0, 3.0), [NOISY_ODOMETRY.format('2.0')]),
-    ((9.61, 0.01), [NOISY_ODOMETRY.format('3.1')]), ((1.0, 1e4), [NOISY_LOOPS.format('100.0')]),
+    ((9.61, 0.01), [NOISY_ODOMETRY.format('3.1'), ACCURATE_LOOPS.format('10')]),
+    ((1.0, 1e4), [NOISY_LOOPS.format('100.0')]),
     ((6.25, 20.25), [NOISY_ODOMETRY.format('2.5'), NOISY_LOOPS.format('4.5')])])
 def test_what_is_twice_as_noisy_as_it_says_or_more_is_told_last(record, variance, said):
     assert list(judgement_sentences(record, judgement(suspect=[5], variance=variance)))[2:] == said

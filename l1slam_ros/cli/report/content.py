@@ -23,12 +23,13 @@ from l1slam_ros.core.robust.batch_map import Outcome
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
     FAILED,
+    NO_WHEELS,
     NORM,
     ONE_JOINS,
-    ONE_PLACE,
     OTHER_MAP,
     PARTS,
     SLIP,
+    UNCONFIRMED,
     UNFINISHED,
     UNSOLVED,
     WEAK,
@@ -60,7 +61,7 @@ _LOOK = 'Look at the images or scans of a few of them'
 _ADVICE = {
     WEAK: f'Record loops of more places, or calibrate the odometry. {_LOOK}: tick as true those '
           'of places that you know.',
-    ONE_PLACE: f'{_LOOK}. One of them ticked as true settles it; ticked as false, they all go.',
+    UNCONFIRMED: f'{_LOOK}. Ticked as true, they settle it; ticked as false, they all go.',
     ONE_JOINS: f'{_LOOK}. Ticked as true, they join the two parts for good; ticked as false, '
                'nothing does.',
     OTHER_MAP: 'Switch to the rival map: which of the two is the place as you know it? If it is '
@@ -75,9 +76,10 @@ _ADVICE = {
           'you know it, solve with `--norm l2`.',
     PARTS: 'Loops between the parts that are surely true, ticked as true, say where one lies from '
            'another. Each part on its own is a map.',
+    NO_WHEELS: 'Record the odometry of the wheels beside the scans.',
     FAILED: 'Please report the sentence.', UNSOLVED: 'Please report the sentence.'}
 # Doubts that no decision about loops settles.
-_UNSETTLED = NORM, FAILED, UNSOLVED
+_UNSETTLED = NORM, NO_WHEELS, FAILED, UNSOLVED
 
 
 def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,

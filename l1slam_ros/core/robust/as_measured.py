@@ -20,8 +20,8 @@ from functools import wraps
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.innovation import BY_CHANCE, student_quantile
 from l1slam_ros.core.robust.inspection import FEWEST
@@ -76,7 +76,9 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
     meant = np.ones((2, graph.manifold.TANGENT_SIZE))
     has_absolute = graph.between.is_absolute.any()
     if not has_absolute:
-        meant[states_identity(graph), graph.manifold.ROTATION] = _TURN
+        roots, rotation = identity_roots(graph), graph.manifold.ROTATION
+        stated = np.isfinite(roots).all(axis=1)
+        meant[stated, rotation] = _TURN * roots[stated, rotation]**2
     first = weighed(graph, meant)
     judgement, poses = judge(first, report, check, known)
     if has_absolute or first is graph and (
@@ -106,12 +108,23 @@ def _stays(graph: FactorGraph, judgement: Judgement) -> bool:
     return not judgement.doubts and bool((fits == judgement.accepted).all())
 
 
-def states_identity(graph: FactorGraph) -> Mask:
-    """Return whether the information of all odometry is the identity, and of all loops, (2,)."""
-    factors = graph.between
-    kinds = factors.is_odometry, ~factors.is_odometry
-    return np.array([bool(kind.any()) and np.allclose(
-        factors.sqrt_information[kind], np.eye(graph.manifold.TANGENT_SIZE)) for kind in kinds])
+def identity_roots(graph: FactorGraph) -> Array:
+    """
+    Return the roots of the information of odometry and of loops where all state the identity.
+
+    (2, k), the diagonals; NaN where a kind states something else, or there is none. An identity
+    that was read as information of quaternions is 1/4 for angles: their vector part is half of
+    the angle.
+    """
+    factors, manifold = graph.between, graph.manifold
+    found = np.full((2, manifold.TANGENT_SIZE), np.nan)
+    for own, kind in zip(found, (factors.is_odometry, ~factors.is_odometry), strict=True):
+        for angles in (1.0,) if manifold is se2 else (1.0, 0.5):
+            roots = np.ones(manifold.TANGENT_SIZE)
+            roots[manifold.ROTATION] = angles
+            if kind.any() and np.allclose(factors.sqrt_information[kind], np.diag(roots)):
+                own[:] = roots
+    return found
 
 
 def _by_number(graph: FactorGraph, judgement: Judgement, poses: Array) -> Array:

@@ -119,6 +119,7 @@ def robust_solve(
         for number, growth in enumerate(rounds(first, repair), 1):
             last = so_far(growth, repair.drift), growth.poses
             report(number, int(np.count_nonzero(growth.loops)))
+        growth.accept_uncontested()
         reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival)
         return judgement_of(growth, reasons, drift=repair.drift, odds=repair.odds), growth.poses
     except FAILURES as error:

@@ -150,7 +150,7 @@ def solve(
     if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
         raise GraphError('the cost leaves double precision: measurements and information of the '
                          'graph are too large, or too different from each other')
-    judgement = robust.judgement.of_all(whole) if robust else None
+    judgement = robust.judgement.of_all(whole).with_parts(whole) if robust else None
     labels = part_labels if robust else component_labels
     offset = shared_offset(whole, solution.poses, judgement) if judgement else None
     return Outcome(solution, minimiser.solver, minimiser.reason, cost(initial), seed_cost, seconds,

@@ -21,7 +21,8 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import part_labels
 from l1slam_ros.core.robust.forecast import CONFIDENT, forecast, right_within, terms_of, unsureness
 from l1slam_ros.core.robust.gating import probability
 from l1slam_ros.core.robust.odometry.drift import straightened
@@ -29,24 +30,19 @@ from l1slam_ros.core.robust.pairwise_consistency import RUN
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds.growth import Growth
 
-# The map expects a large error of itself, or no loop is accepted; all that are accepted are of one
-# place, which odometry hardly bears out; loops of one place alone say how two parts lie to each
-# other; refused loops agree on another map, and none that is accepted speaks against them; an
-# odometry factor may have slipped, and it was not believed; the odometry drifts, which was taken
-# for noise; there were more rounds to come; another norm of the same factors has another map;
-# judging the loops failed, and what is believed is what was by then; so did solving for what is
-# believed; nothing accepted joins two parts.
-WEAK = 'a weak map'
-ONE_PLACE = 'one place'
-ONE_JOINS = 'one place joins'
-OTHER_MAP = 'another map'
-SLIP = 'a slip suspected'
-DRIFTS = 'a drift suspected'
-UNFINISHED = 'not at an end'
-NORM = 'another norm'
-FAILED = 'judging failed'
-UNSOLVED = 'solving failed'
-PARTS = 'parts'
+# Kinds of doubts, each with what it means.
+WEAK = 'a weak map'  # it expects a large error of itself, or no loop is accepted
+UNCONFIRMED = 'unconfirmed loops'  # odometry alone hardly confirms the accepted ones
+ONE_JOINS = 'one place joins'  # loops of one place alone join two parts
+OTHER_MAP = 'another map'  # refused loops agree on it, and no accepted one contradicts them
+SLIP = 'a slip suspected'  # an odometry factor may have slipped
+DRIFTS = 'a drift suspected'  # the odometry drifts, which was taken for noise
+UNFINISHED = 'not at an end'  # there were more rounds to come
+NORM = 'another norm'  # the same factors have another map in another norm
+NO_WHEELS = 'no wheels'  # scans alone show the motion
+FAILED = 'judging failed'  # the map is of what was accepted by then
+UNSOLVED = 'solving failed'  # so did solving for what is accepted
+PARTS = 'parts'  # nothing accepted joins them
 
 
 @dataclass(frozen=True)
@@ -154,6 +150,19 @@ class Judgement:
                        suspect=spread(self.suspect, False), sigmas=spread(self.sigmas, np.nan),
                        noise=spread(self.noise, 1.0), slips=rows[self.slips[self.slips < k]])
 
+    def with_parts(self, graph: FactorGraph) -> 'Judgement':
+        """Return the judgement of all factors of a graph, doubted if none joins some parts."""
+        part = part_labels(graph.subset(self.accepted))
+        firsts = np.unique(part, return_index=True)[1]
+        if len(firsts) < 2:
+            return self
+        factors = graph.between
+        pairs = factors.pairs[~factors.is_odometry & ~factors.is_absolute & ~factors.struck]
+        across = pairs[part[pairs[:, 0]] != part[pairs[:, 1]]]
+        doubt = Doubt(PARTS, len(across), int(firsts[1]) - 1, int(firsts[-1]),
+                      f'{len(firsts):,}', listed(across))
+        return replace(self, doubts=(*self.doubts, doubt))
+
     def of_factors(self, which: Indices) -> 'Judgement':
         """Return the judgement of some of the factors, (k,), or of some several times."""
         slipped = np.isin(np.arange(len(self.accepted)), self.slips)
@@ -212,15 +221,6 @@ def doubt_of(graph: FactorGraph, rows: Indices | Mask, kind: str, detail: str = 
     return Doubt(kind, len(pairs), first, last, detail, listed(pairs))
 
 
-def doubt_of_parts(factors: BetweenFactors, part: Indices) -> Doubt:
-    """Return the doubt of a map whose keyframes are of parts (n,) that nothing accepted joins."""
-    firsts = np.unique(part, return_index=True)[1]
-    pairs = factors.pairs[~factors.is_odometry & ~factors.is_absolute & ~factors.struck]
-    across = pairs[part[pairs[:, 0]] != part[pairs[:, 1]]]
-    return Doubt(PARTS, len(across), int(firsts[1]) - 1, int(firsts[-1]), f'{len(firsts):,}',
-                 listed(across))
-
-
 def listed(pairs: Indices) -> tuple[tuple[int, int], ...]:
     """Return pairs of keyframes (k, 2) as a doubt has them."""
     return tuple((i, j) for i, j in pairs.tolist())
@@ -274,15 +274,10 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float =
     reasons = tuple(
         doubt for doubt in reasons if doubt.kind != DRIFTS or not confidence >= CONFIDENT)
     left_out = np.flatnonzero(loops & ~believed.accepted)
-    # Where no loop that was left out fits, so vague a map would have been made of all true ones,
-    # weighed as stated, too; there is nothing to settle. Of fewer loops than a run has nothing is
-    # recorded.
     noise = _noise(growth)[:size]
-    if (len(left_out) and np.count_nonzero(loops) >= RUN
-            and (suspect[left_out].any() or (noise != 1).any() or not accepts_any)
-            and forecast(terms[:3]) < CONFIDENT):
+    if not reasons and confidence < CONFIDENT:
         metres = unsure * right_within(given.graph.manifold.positions(growth.poses))
-        reasons += (doubt_of(given.graph, left_out, WEAK, f'{metres:.2g}'),)
+        reasons += (doubt_of(given.graph, left_out, WEAK, f'{metres:.2g}' * accepts_any),)
     doubted = OTHER_MAP in kinds or bool(
         2 * len(left_out) > np.count_nonzero(loops) >= RUN)
     return replace(believed, suspect=suspect[:size], sigmas=np.sqrt(square[:size]),

@@ -26,9 +26,9 @@ from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
     ONE_JOINS,
-    ONE_PLACE,
     OTHER_MAP,
     SLIP,
+    UNCONFIRMED,
     UNFINISHED,
     Doubt,
     doubt_of,
@@ -36,7 +36,6 @@ from l1slam_ros.core.robust.judgement import (
 from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
 from l1slam_ros.core.robust.odometry.untold import LEAST
 from l1slam_ros.core.robust.pairwise_consistency import (
-    RUN,
     agree_at_a_place,
     longest_run,
     runs,
@@ -60,8 +59,8 @@ def doubts(growth: Growth, ended: bool = True, rival: float = 0.0) -> tuple[Doub
     reasons = []
     if not ended and len(left_out):
         reasons.append(doubt_of(graph, left_out, UNFINISHED))
-    if _decides_alone(growth, accepted):
-        reasons.append(doubt_of(graph, accepted, ONE_PLACE))
+    if growth.uncontested.any() or _decides_alone(growth, accepted):
+        reasons.append(doubt_of(graph, accepted, UNCONFIRMED))
     if growth.given.gap.any():
         reasons += [doubt_of(graph, rows, ONE_JOINS) for rows in _joining_alone(growth)]
     agree = _agree(growth)
@@ -82,7 +81,7 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
     hardly is a mistake: it only has to be likelier true than false.
     """
     given = growth.given
-    if (len(accepted) < RUN or not given.may_err_as_one(accepted, TWO_PLACES)
+    if (not len(accepted) or not given.may_err_as_one(accepted, TWO_PLACES)
             or (given.trusted | given.factors.is_absolute)[accepted].any()):
         return False
     odometry = growth.copy()

@@ -40,11 +40,17 @@ _MORE_LOOPS = 0.1
 
 @dataclass(frozen=True)
 class ScanMap:
-    """A graph made from scans, the points of its keyframes, and the poses of all scans."""
+    """
+    A graph made from scans.
+
+    points : of its keyframes; path : the poses of all scans; has_wheels : in each drive in which
+    the scans move, so does the odometry beside them.
+    """
 
     record: GraphRecord
     points: list[Points]
     path: ScanPath
+    has_wheels: bool
 
 
 def map_scans(scans: Iterable[tuple[Scan, Array]], mount: Mount,
@@ -93,6 +99,8 @@ class _Making:
         self._stamps: list[int] = []
         self._poses: list[Array] = []
         self._last: list[int] = []
+        self._first_wheels: list[Array] = []
+        self._turned: set[int] = set()  # the drives whose wheels did
 
     def begin_drive(self, mount: Mount) -> None:
         """Begin another drive with the next scan."""
@@ -101,6 +109,10 @@ class _Making:
 
     def take(self, scan: Scan, wheels: Array) -> bool:
         """Add a scan; return whether it became a keyframe."""
+        if len(self._first_wheels) == self._drive:
+            self._first_wheels.append(wheels)
+        if (wheels != self._first_wheels[-1]).any():
+            self._turned.add(self._drive)
         step = self._front_end.add(scan, wheels)
         if step.said:
             self._said.append(step.said)
@@ -141,7 +153,9 @@ class _Making:
         record = GraphRecord(self._graph, None, np.arange(self._graph.n_poses), stamps, said)
         path = ScanPath(np.array(self._stamps, np.int64), np.array(self._poses).reshape(-1, 3),
                         np.array(self._last, np.int64))
-        return ScanMap(record, [keyframe.points for keyframe in keyframes], path)
+        drives, count = np.unique(self._graph.robot, return_counts=True)
+        has_wheels = self._turned.issuperset(drives[count > 1].tolist())
+        return ScanMap(record, [keyframe.points for keyframe in keyframes], path, has_wheels)
 
 
 def _mapped(graph: FactorGraph) -> tuple[Array, Array]:

@@ -193,6 +193,8 @@ class Updates:
         front = front_of(replace(problem, judgement=judgement), poses,
                          len(whole.graph.between), check)
         improvement = improvement.of_all(whole)
+        improvement = replace(
+            improvement, judgement=improvement.judgement.with_parts(whole.graph))
         take_judgement(keeper, now, improvement.judgement, improvement.poses, True, True)
         keeper.adopt(improvement, front, improvement.judgement)
         return improvement

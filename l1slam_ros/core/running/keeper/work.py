@@ -132,8 +132,10 @@ def judge_all(keeper: Keeper, anew: bool, moment: Moment, check: Check) -> None:
             keeper.change(now.map, lambda state, _: state.given_up(time.monotonic()))
         raise
     check()
-    take_judgement(keeper, now, *as_numbered(
-        order, judgement.of_all(turned.graph), l2_poses), anew, moment.stands)
+    judgement = judgement.of_all(turned.graph)
+    if anew:
+        judgement = judgement.with_parts(turned.graph)
+    take_judgement(keeper, now, *as_numbered(order, judgement, l2_poses), anew, moment.stands)
 
 
 def compare_norms(keeper: Keeper, check: Check) -> None:
