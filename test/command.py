@@ -22,6 +22,6 @@ def run(capsys, *arguments, code=0):
     return out, err
 
 
-def solve_json(capsys, *arguments):
-    """Return what `l1slam solve --json` says."""
-    return json.loads(run(capsys, 'solve', *arguments, '--json')[0])
+def solve_json(capsys, *arguments, code=0):
+    """Return what `l1slam solve --json` says, which must end with a code."""
+    return json.loads(run(capsys, 'solve', *arguments, '--json', code=code)[0])

@@ -104,7 +104,7 @@ def test_symbols_stay_and_edges_to_the_other_file_are_used_once(world, tmp_path,
 
 def test_what_does_not_join_lies_beside_and_is_said(world, tmp_path, capsys):
     paths, _ = cut(world, tmp_path)
-    found, said = merge_json(capsys, *paths, '--output', tmp_path / 'out.g2o')
+    found, said = merge_json(capsys, *paths, '--output', tmp_path / 'out.g2o', code=4)
     assert found['parts'] == 2
     assert said.count(f'{paths[1]}: nothing that is believed joins it to {paths[0]}') == 1
     poses = read_input(tmp_path / 'out.g2o').poses
