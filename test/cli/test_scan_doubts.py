@@ -105,12 +105,19 @@ def upside_down():
                    for scan in scans], wheels
 
 
+def without_wheels():
+    """Return a drive of a robot without encoders: its odometry never moves."""
+    scans, wheels = drive(ROUND)
+    return ROUND, scans, np.zeros_like(wheels)
+
+
 CASES = {
     'a tenth of the rays is random': lambda: (ROUND, *drive(ROUND, spoil=random_rays)),
     'a fifth goes through glass': lambda: (ROUND, *drive(ROUND, spoil=glass)),
     'a mirrored corridor': mirrored_corridor, 'two equal rooms': equal_rooms,
     'carried away': carried, 'carried away in the dark': carried_in_the_dark,
-    'carried elsewhere': carried_elsewhere, 'upside down': upside_down}
+    'carried elsewhere': carried_elsewhere, 'upside down': upside_down,
+    'without wheels': without_wheels}
 
 
 @pytest.fixture(scope='module')
@@ -152,3 +159,9 @@ def test_a_drive_in_parts_that_nothing_joins_is_doubtful(solved):
     assert code == 4 and said['parts'] == 2
     assert [doubt['kind'] for doubt in said['doubts']] == ['parts']
     assert ' joins 2 parts of the map, between ' in said['warnings'][-1]
+
+
+def test_a_drive_of_which_scans_alone_show_the_motion_is_doubtful(solved):
+    code, said = solved('without wheels')
+    assert code == 4 and 'no wheels' in [doubt['kind'] for doubt in said['doubts']]
+    assert any('the odometry beside the scans never moves' in one for one in said['warnings'])
