@@ -22,14 +22,9 @@ import numpy as np
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+from l1slam_ros.core.graph.landmarks import start_poses
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
-from l1slam_ros.core.graph.parts import (
-    bridged,
-    initial_poses,
-    odometry_gaps,
-    part_labels,
-    require_connected,
-)
+from l1slam_ros.core.graph.parts import odometry_gaps, part_labels, require_connected
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.as_measured import OnRound
@@ -126,7 +121,7 @@ def solve(
     _require_start(graph, stored, asked, ids)
     seed = None
     initial = (odometry_poses(graph) if asked.start == 'odometry'
-               else initial_poses(graph if asked.robust is False else bridged(graph), stored, ids))
+               else start_poses(graph, stored, ids, whole=asked.robust is not False))
     minimiser = _Minimiser(asked, report, on_choice)
     began = time.perf_counter()
     robust, unjudged = _robust_map(graph, asked, minimiser, on_round, ids)
