@@ -80,7 +80,7 @@ def steps_of(growth: Growth, rows: Indices) -> Array:
 
 def usual_motion(growth: Growth) -> Motion:
     """Return how the robot moves by its odometry."""
-    step = steps_of(growth, np.flatnonzero(~growth.given.is_loop & ~growth.cut))
+    step = steps_of(growth, np.flatnonzero(growth.given.is_step & ~growth.cut))
     least = np.diag(SAME**2 * (step**2).mean(axis=0) + TINY)
     translation = growth.given.graph.manifold.TRANSLATION
     width = np.full(len(least), np.pi**2 / 3)
