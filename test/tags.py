@@ -23,7 +23,8 @@ def _quaternion(vector):
 
 def _times(a, b):
     """Return the product of two quaternions x y z w."""
-    return np.append(a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3]), a[3] * b[3] - a[:3] @ b[:3])
+    vector = a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])
+    return np.append(vector, a[3] * b[3] - a[:3] @ b[:3])
 
 
 def _turn(q, v):
@@ -72,7 +73,7 @@ class TagWorld:
         for k in range(poses):
             for tag, mark in enumerate(marks):
                 seen = _turn(_inverse(truth[k][1]), mark[0] - truth[k][0])
-                if 0 < seen[0] and np.linalg.norm(seen) < _SEEN:
+                if seen[0] > 0 and np.linalg.norm(seen) < _SEEN:
                     if rng.uniform() < false:  # another tag's number, or a wrong pose
                         self.false.add((k, tag))
                         mark = (_SEEN * rng.uniform(-1, 1, 3) * (1, 1, space), _quaternion(

@@ -16,10 +16,9 @@ one of its sightings, as on a side branch of the way, so that the others are loo
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import LANDMARK, NO_PREDECESSOR, WORLD, FactorGraph
-from l1slam_ros.core.graph.parts import bridged, initial_poses
 from l1slam_ros.core.graph.spanning_tree import pair_key
 
 
@@ -165,14 +164,8 @@ def along_the_way(graph: FactorGraph, placing: Indices) -> tuple[FactorGraph, In
     return way, number
 
 
-def start_poses(graph: FactorGraph, stored: Array | None, ids: Indices,
-                whole: bool = False) -> Array:
-    """
-    Return what `initial_poses` does, (n, p), landmarks as their first sightings say.
-
-    whole : join the parts of the graph, where it has several
-    """
-    if stored is not None or not graph.is_landmark.any():
-        return initial_poses(bridged(graph) if whole else graph, stored, ids)
-    way, number = along_the_way(graph, first_sightings(graph))
-    return initial_poses(bridged(way) if whole else way, None, ids[np.argsort(number)])[number]
+def by_first_sightings(graph: FactorGraph) -> tuple[FactorGraph, Indices]:
+    """Return `along_the_way` with landmarks placed by their first sightings; none: the graph."""
+    if not graph.is_landmark.any():
+        return graph, np.arange(graph.n_poses)
+    return along_the_way(graph, first_sightings(graph))

@@ -22,9 +22,15 @@ import numpy as np
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
-from l1slam_ros.core.graph.landmarks import start_poses
+from l1slam_ros.core.graph.landmarks import by_first_sightings
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
-from l1slam_ros.core.graph.parts import odometry_gaps, part_labels, require_connected
+from l1slam_ros.core.graph.parts import (
+    bridged,
+    initial_poses,
+    odometry_gaps,
+    part_labels,
+    require_connected,
+)
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.as_measured import OnRound
@@ -118,10 +124,17 @@ def solve(
     ids = np.arange(graph.n_poses) if ids is None else ids
     whole = graph
     graph = graph.without_struck()  # what is struck out is there for nobody
-    _require_start(graph, stored, asked, ids)
+    way, number = by_first_sightings(graph)
+    named = ids[np.argsort(number)]
+    _require_start(way, stored, asked, named)
     seed = None
-    initial = (odometry_poses(graph) if asked.start == 'odometry'
-               else start_poses(graph, stored, ids, whole=asked.robust is not False))
+    if asked.start == 'odometry':
+        initial = odometry_poses(way)[number]
+    elif stored is None:
+        whole_way = way if asked.robust is False else bridged(way)
+        initial = initial_poses(whole_way, None, named)[number]
+    else:
+        initial = stored
     minimiser = _Minimiser(asked, report, on_choice)
     began = time.perf_counter()
     robust, unjudged = _robust_map(graph, asked, minimiser, on_round, ids)

@@ -24,7 +24,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import covariance_of
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
-from l1slam_ros.core.graph.landmarks import along_the_way, first_sightings, sightings
+from l1slam_ros.core.graph.landmarks import along_the_way, by_first_sightings, sightings
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.as_measured import Believed, Judge, OnRound
@@ -76,7 +76,6 @@ class _Sightings:
     def __init__(self, graph: FactorGraph):
         self.rows, self.seen, self.keyframe = sightings(graph)
         manifold = self._manifold = graph.manifold
-        self._first = first_sightings(graph)
         backward = self.rows[graph.between.i[self.rows] == self.seen]
         factors = turned(graph, backward).between
         self._trusted = factors.trusted[self.rows]
@@ -90,7 +89,8 @@ class _Sightings:
         k, row = np.nonzero(~factors.speaks[self.rows])
         self.C[k, row, row] = width[row]
         chain, spread, piece = _odometry(graph)
-        self.X, self.spread, self.chain = (of[self.keyframe] for of in (chain, spread, piece))
+        self.X, self.spread = chain[self.keyframe], spread[self.keyframe]
+        self.chain = piece[self.keyframe]
 
     def likeliest(self) -> Indices:
         """
@@ -128,10 +128,10 @@ def _odometry(graph: FactorGraph) -> tuple[Array, Array, Indices]:
     The covariance is of steps at the origin, from the left, and adds up along the way.
     """
     manifold = graph.manifold
-    way, number = along_the_way(graph, first_sightings(graph))
+    way, number = by_first_sightings(graph)
     whole = bridged(way)
     poses = odometry_poses(whole)
-    step = np.maximum(way.between.step_to, -1)
+    step = way.between.step_to
     known = (step >= 0) & ~way.is_landmark
     factors = turned(way, way.between.i > way.between.j).between
     own = np.zeros((len(poses), manifold.TANGENT_SIZE, manifold.TANGENT_SIZE))
