@@ -12,7 +12,8 @@ import numpy as np
 
 LAP = 100  # poses, 1 m apart
 _SIDE, _SEEN = 25, 5.0
-_SIGMA_STEP, _SIGMA_TURN, _SIGMA_SIGHT, _SIGMA_SIGHT_TURN = 0.02, 0.005, 0.05, 0.03
+# [m, rad] Of a step, and of a sighting.
+_SIGMAS = (0.02, 0.005), (0.05, 0.03)
 
 
 def _quaternion(vector):
@@ -42,55 +43,80 @@ class TagWorld:
 
     Attributes
     ----------
-    truth : (n, 7) poses of the robot; edges : (tail, head, pose (7,), is a sighting); tails and
-    heads are numbers of poses, of tags from `n` on; false : set of (pose, tag)
+    truth : of the poses of the robot, as of the tags, (position (3,), quaternion (4,)); edges :
+    [tail, head, (7,), is a sighting], heads from `n` on are tags; false : set of (pose, tag)
 
     """
 
     def __init__(self, seed, poses=300, tags=6, false=0.0, space=False):
-        rng = np.random.default_rng(seed)
+        self._rng = rng = np.random.default_rng(seed)
         self.space, self.n, self.tags = space, poses, tags
-        up = np.array([0, 0, 1.0])
-        truth = [(np.zeros(3), np.array([0, 0, 0, 1.0]))]
+        self._up = np.array([0, 0, 1.0])
+        self.truth = [(np.zeros(3), np.array([0, 0, 0, 1.0]))]
         for k in range(1, poses):
-            p, q = truth[-1]
+            p, q = self.truth[-1]
             p = p + _turn(q, np.array([1.0, 0, 0]))
-            if space:
-                p[2] = np.sin(k / LAP * 4 * np.pi)
-            truth.append((p, _times(q, _quaternion(up * np.pi / 2 * (k % _SIDE == 0)))))
-        self.truth = np.array([np.concatenate(pose) for pose in truth])
-        at = rng.choice(LAP, tags, replace=False) if tags <= LAP else None
-        marks = []
-        for k in at:
-            p, q = truth[k]
-            side = np.array([rng.uniform(1, 3), rng.choice((-1, 1)) * rng.uniform(1, 2),
-                             rng.uniform(0, 1) * space])
-            turn = rng.normal(size=3) if space else up * rng.uniform(-3, 3)
-            marks.append((p + _turn(q, side), _times(q, _quaternion(turn))))
+            p[2] = np.sin(k / LAP * 4 * np.pi) * space
+            q = _times(q, _quaternion(self._up * np.pi / 2 * (k % _SIDE == 0)))
+            self.truth.append((p, q))
+        self._marks = [self._beside(*self.truth[k])
+                       for k in rng.choice(LAP, tags, replace=False).tolist()]
         self.edges, self.false = [], set()
         for k in range(1, poses):
-            self._see(rng, k - 1, k, truth[k - 1], truth[k], (_SIGMA_STEP, _SIGMA_TURN), False)
+            self._measure(k - 1, k, self.truth[k], False)
         for k in range(poses):
-            for tag, mark in enumerate(marks):
-                seen = _turn(_inverse(truth[k][1]), mark[0] - truth[k][0])
-                if seen[0] > 0 and np.linalg.norm(seen) < _SEEN:
-                    if rng.uniform() < false:  # another tag's number, or a wrong pose
-                        self.false.add((k, tag))
-                        mark = (_SEEN * rng.uniform(-1, 1, 3) * (1, 1, space), _quaternion(
-                            rng.normal(size=3) * 2 if space else up * rng.uniform(-3, 3)))
-                        mark = (truth[k][0] + mark[0], mark[1])
-                    self._see(rng, k, poses + tag, truth[k], mark,
-                              (_SIGMA_SIGHT, _SIGMA_SIGHT_TURN), True)
+            away = np.array([at for at, _ in self._marks]) - self.truth[k][0]
+            for tag in np.flatnonzero(np.linalg.norm(away, axis=1) < _SEEN).tolist():
+                if _turn(_inverse(self.truth[k][1]), away[tag])[0] > 0:
+                    self.see(k, tag, rng.uniform() < false)
 
-    def _see(self, rng, tail, head, a, b, sigma, sighting):
-        p, q = _turn(_inverse(a[1]), b[0] - a[0]), _times(_inverse(a[1]), b[1])
-        on = np.ones(3) if self.space else np.array([1, 1, 0.0])
-        turn = np.ones(3) if self.space else np.array([0, 0, 1.0])
-        p = p + _turn(q, rng.normal(0, sigma[0], 3) * on)
-        q = _times(q, _quaternion(rng.normal(0, sigma[1], 3) * turn))
-        self.edges.append((tail, head, np.concatenate((p, q)), sighting))
+    @property
+    def sightings(self):
+        """How many there are."""
+        return sum(edge[3] for edge in self.edges)
 
-    def write(self, path, ids=None, tags_first=False, identity=False, vertices=False):
+    @property
+    def false_pairs(self):
+        """The pairs of ids of false sightings, as `write` gives them where none are asked for."""
+        return {(pose, 10 * self.n + tag) for pose, tag in self.false}
+
+    def see(self, pose, tag, false=False):
+        """Add a sighting; a false one is of something near, turned by anything."""
+        mark = self._marks[tag]
+        if false:
+            self.false.add((pose, tag))
+            at = _SEEN * self._rng.uniform(-1, 1, 3) * (1, 1, self.space)
+            mark = self.truth[pose][0] + at, self._any_turn()
+        self._measure(pose, self.n + tag, mark, True)
+
+    def falsify_first(self, tag):
+        """Let the first sighting of a tag be false."""
+        first = next(k for k, edge in enumerate(self.edges) if edge[1] == self.n + tag)
+        self.see(self.edges[first][0], tag, True)
+        self.edges[first] = self.edges.pop()
+
+    def _beside(self, p, q):
+        rng = self._rng
+        side = np.array([rng.uniform(1, 3), rng.choice((-1, 1)) * rng.uniform(1, 2),
+                         rng.uniform(0, 1) * self.space])
+        return p + _turn(q, side), _times(q, self._any_turn())
+
+    def _any_turn(self):
+        return _quaternion(2 * self._rng.normal(size=3) if self.space
+                           else self._up * self._rng.uniform(-3, 3))
+
+    def _measure(self, tail, head, there, sighting):
+        """Add the edge from a pose of the robot to what is there."""
+        move, turn = _SIGMAS[sighting]
+        p, q = self.truth[tail]
+        at, turned = _turn(_inverse(q), there[0] - p), _times(_inverse(q), there[1])
+        plane = np.ones(3) if self.space else 1 - self._up
+        axes = np.ones(3) if self.space else self._up
+        at = at + _turn(turned, self._rng.normal(0, move, 3) * plane)
+        turned = _times(turned, _quaternion(self._rng.normal(0, turn, 3) * axes))
+        self.edges.append([tail, head, np.concatenate((at, turned)), sighting])
+
+    def write(self, path, ids=None, tags_first=False):
         """Write the graph, and its truth beside it; ids : of poses and then of tags."""
         if ids is None:
             ids = [*range(self.n), *range(10 * self.n, 10 * self.n + self.tags)]
@@ -98,18 +124,18 @@ class TagWorld:
         sights = [line for line, edge in zip(lines, self.edges, strict=True) if edge[3]]
         steps = [line for line, edge in zip(lines, self.edges, strict=True) if not edge[3]]
         path.write_text('\n'.join(sights + steps if tags_first else steps + sights) + '\n')
-        truth = path.with_suffix('.tum') if self.space else path.with_suffix('.txt')
-        truth.write_text(''.join(self._true(ids[k], pose) for k, pose in enumerate(self.truth)))
+        truth = path.with_name('truth.g2o' if self.space else 'truth.txt')
+        truth.write_text(''.join(self._true(ids[k], np.concatenate(pose))
+                                 for k, pose in enumerate(self.truth)))
         return truth
 
     def _true(self, vertex, pose):
         if self.space:
-            return 'VERTEX_SE3:QUAT ' + ' '.join(map(str, [vertex, *pose.tolist()])) + '\n'
+            return ' '.join(map(str, ['VERTEX_SE3:QUAT', vertex, *pose])) + '\n'
         return f'{vertex} {pose[0]} {pose[1]} {2 * np.arctan2(pose[5], pose[6])}\n'
 
     def _line(self, ids, tail, head, pose, sighting):
-        sigma = (_SIGMA_SIGHT, _SIGMA_SIGHT_TURN) if sighting else (_SIGMA_STEP, _SIGMA_TURN)
-        move, turn = (1 / one**2 for one in sigma)
+        move, turn = (1 / one**2 for one in _SIGMAS[sighting])
         if self.space:
             # The information is that of the quaternion's vector part, half of the angle.
             diagonal = np.repeat((move, 4 * turn), 3)
