@@ -124,8 +124,11 @@ def _on_parts(record: GraphRecord) -> Iterator[str]:
 def _on_gaps(record: GraphRecord) -> Iterator[str]:
     gaps = odometry_gaps(record.graph)
     gaps = gaps[np.diff(robots_of(record.ids))[gaps] == 0]
-    # No odometry leads to a landmark; past those, to the next pose.
-    robots = np.flatnonzero(~record.graph.is_landmark)
+    # No odometry leads to a landmark; past those, to the next pose. What is seen but once may as
+    # well be a pose whose odometry is missing.
+    factors, n = record.graph.between, record.graph.n_poses
+    edges = np.bincount(factors.pairs[~factors.is_absolute].ravel(), minlength=n)
+    robots = np.flatnonzero(~record.graph.is_landmark | (edges < 2))
     gaps = np.intersect1d(gaps + 1, robots[1:])
     before = robots[np.searchsorted(robots, gaps) - 1]
     if len(gaps):

@@ -81,7 +81,7 @@ def find_landmarks(predecessor: Indices, ids: Indices, i: Indices, j: Indices) -
     sees = alone[i] & alone[j]
     alone[i[sees]] = alone[j[sees]] = False
     only_seen = (np.bincount(i, minlength=n) == 0) & (edges >= 2) & ~alone
-    landmark = alone | (only_seen & joined(before, after))
+    landmark = alone | (only_seen & (behind | ahead) & joined(before, after))
     # Ids of landmarks may be anything: their differences are beyond 64 bits.
     value = ids.astype(float)
     step = np.where(before >= 0, value - value[before], 0.0)

@@ -124,17 +124,8 @@ def solve(
     ids = np.arange(graph.n_poses) if ids is None else ids
     whole = graph
     graph = graph.without_struck()  # what is struck out is there for nobody
-    way, number = by_first_sightings(graph)
-    named = ids[np.argsort(number)]
-    _require_start(way, stored, asked, named)
+    initial = _initial(graph, stored, asked, ids)
     seed = None
-    if asked.start == 'odometry':
-        initial = odometry_poses(way)[number]
-    elif stored is None:
-        whole_way = way if asked.robust is False else bridged(way)
-        initial = initial_poses(whole_way, None, named)[number]
-    else:
-        initial = stored
     minimiser = _Minimiser(asked, report, on_choice)
     began = time.perf_counter()
     robust, unjudged = _robust_map(graph, asked, minimiser, on_round, ids)
@@ -242,6 +233,18 @@ def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Arr
                          for one in np.ascontiguousarray(b.T)], axis=1)
 
     return lacked_step(part, is_loop, system.b, np.ones(2), left_of)
+
+
+def _initial(graph: FactorGraph, stored: Array | None, asked: SolveOptions,
+             ids: Indices) -> Array:
+    """Return the poses to start from, or to take the initial cost at, (n, p)."""
+    way, number = by_first_sightings(graph)
+    order = np.argsort(number)
+    _require_start(way, stored, asked, ids[order])
+    if asked.start == 'odometry':
+        return odometry_poses(way)[number]
+    return initial_poses(way if asked.robust is False else bridged(way),
+                         None if stored is None else stored[order], ids[order])[number]
 
 
 def _require_start(graph: FactorGraph, stored: Array | None, asked: SolveOptions,
