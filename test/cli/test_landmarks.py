@@ -177,3 +177,24 @@ def test_one_step_of_odometry_and_all_else_seen_once(tmp_path, capsys):
 def test_the_last_pose_of_a_robot_is_none(tmp_path, capsys):
     edges = [(a, b, 1) for a, b in pairwise(range(20))] + [(3, 19, 16), (2, 19, 17), (1, 0, -1)]
     assert 'landmarks' not in run(capsys, 'info', star(tmp_path, edges))[0]
+
+
+def test_what_places_a_landmark_is_not_suspected_as_a_slip_of_the_odometry(tmp_path, capsys):
+    world = TagWorld(4, 300, 8, 0.1)
+    truth = world.write(tmp_path / 'tags.g2o')
+    lines = (tmp_path / 'tags.g2o').read_text()
+    # The information of sightings is a hundredth of what it should be.
+    (tmp_path / 'tags.g2o').write_text(lines.replace('399.99999999999994', '4').replace(
+        '1111.111111111111', '11.1'))
+    found = solve_json(capsys, tmp_path / 'tags.g2o', '--reference', truth)
+    assert world.false_pairs <= left_out(found) and found['ate'] < 0.15
+    assert not found['doubts'] and not found['slips']
+
+
+def test_a_slip_of_the_odometry_is_found_beside_landmarks(tmp_path, capsys):
+    world = TagWorld(1, 300, 6, 0.1)
+    for edge in world.edges[150:152]:
+        edge[2][:2] += 0.7, 0.5
+    found = solved(capsys, tmp_path, world)
+    assert found['slips'] == [[150, 151], [151, 152]] and found['ate'] < 0.15
+    assert left_out(found) == world.false_pairs | {(150, 151), (151, 152)}

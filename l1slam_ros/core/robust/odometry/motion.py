@@ -118,7 +118,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     manifold = given.graph.manifold
     factors = given.factors
     k = manifold.TANGENT_SIZE
-    rows = np.flatnonzero(~given.is_loop & ~given.gap & (factors.freedom == k))
+    rows = np.flatnonzero(given.is_step & ~given.gap & (factors.freedom == k))
     at = np.searchsorted(np.flatnonzero(growth.accepted), rows)
     R, r = growth.posterior.moment[at], growth.posterior.residual[at]
     inverse = np.linalg.inv(R + TINY * np.eye(k))

@@ -28,7 +28,7 @@ from l1slam_ros.core.graph.landmarks import along_the_way, by_first_sightings, s
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.as_measured import Believed, Judge, OnRound
-from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.robust.judgement import Doubt, listed
 
 # A sighting is compared with so many later ones of its landmark.
 _COMPARED = 20
@@ -53,14 +53,17 @@ def _judged(judge: Judge, graph: FactorGraph, placing: Indices, report: OnRound,
     way, number = along_the_way(graph, placing)
     order = np.argsort(number)
     judgement, poses = judge(way, report, check, known and (known[0], known[1][order]))
-    return _of_sightings(judgement.renumbered(order), graph, placing), poses[number]
-
-
-def _of_sightings(judgement: Judgement, graph: FactorGraph, placing: Indices) -> Judgement:
-    """Return a judgement where what placed landmarks is no odometry, but a loop as others are."""
-    noise = judgement.noise.copy()
+    noise = judgement.noise.copy()  # what places a landmark is a loop as others are
     noise[placing] = noise[~graph.between.is_odometry].min(initial=np.inf)
-    return replace(judgement, noise=noise, slips=np.setdiff1d(judgement.slips, placing))
+    doubts = tuple(_renumbered(doubt, order) for doubt in judgement.doubts)
+    return replace(judgement, noise=noise, doubts=doubts), poses[number]
+
+
+def _renumbered(doubt: Doubt, order: Indices) -> Doubt:
+    """Return a doubt where keyframe k is order[k]; a slip lies between the ends of its step."""
+    first, last = np.sort(order[[doubt.first, doubt.last]]).tolist()
+    pairs = order[np.array(doubt.pairs, np.int64).reshape(-1, 2)]
+    return replace(doubt, first=first, last=last, pairs=listed(pairs))
 
 
 class _Sightings:
