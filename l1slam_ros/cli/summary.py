@@ -64,6 +64,9 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
         ('odometry', f'{int(factors.is_odometry.sum()):,}, {length:,.1f} m'),
         ('loops', f'{int(is_loop.sum()):,}{beside}{struck}'),
         ('components', f'{len(connected_parts(graph)):,}')]
+    landmarks = int(graph.is_landmark.sum())
+    if landmarks:
+        rows.insert(1, ('landmarks', f'{landmarks:,} of the poses; each edge to one is a loop'))
     names = robot_names(ids)
     if len(names) > 1:
         rows.insert(1, ('robots', f'{len(names)}: {", ".join(names)}'))
@@ -121,8 +124,16 @@ def _on_parts(record: GraphRecord) -> Iterator[str]:
 def _on_gaps(record: GraphRecord) -> Iterator[str]:
     gaps = odometry_gaps(record.graph)
     gaps = gaps[np.diff(robots_of(record.ids))[gaps] == 0]
+    # No odometry leads to a landmark; past those, to the next pose. What is seen but once may as
+    # well be a pose whose odometry is missing.
+    factors, n = record.graph.between, record.graph.n_poses
+    edges = np.bincount(factors.pairs[~factors.is_absolute].ravel(), minlength=n)
+    robots = np.flatnonzero(~record.graph.is_landmark | (edges < 2))
+    gaps = np.intersect1d(gaps + 1, robots[1:])
+    before = robots[np.searchsorted(robots, gaps) - 1]
     if len(gaps):
-        pairs = [f'{record.ids[k]} and {record.ids[k + 1]}' for k in gaps[:_NAMED]]
+        pairs = [f'{record.ids[a]} and {record.ids[b]}'
+                 for a, b in zip(before[:_NAMED], gaps[:_NAMED], strict=True)]
         yield (f'the odometry has {_listed("gap", pairs, len(gaps))}, consecutive vertices '
                'without an edge')
 

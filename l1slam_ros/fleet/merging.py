@@ -25,6 +25,7 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import (
+    LANDMARK,
     NO_PREDECESSOR,
     WORLD,
     FactorGraph,
@@ -140,6 +141,12 @@ def _keyframes(parts: Sequence[Part], ids: Indices, of_input: Indices,
         follows = before != NO_PREDECESSOR
         graph.follow(place[follows], place[before[follows]])
         graph.follow(place[1:][~follows[1:]], NO_PREDECESSOR)
+    landmark = np.concatenate([place[part.record.graph.is_landmark]
+                               for part, place in zip(parts, own, strict=True)])
+    if len(landmark):
+        robot = graph.robot.copy()
+        robot[landmark] = LANDMARK
+        graph.follow(landmark, NO_PREDECESSOR, robot)
     return graph
 
 

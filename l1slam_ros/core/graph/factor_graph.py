@@ -31,6 +31,8 @@ from l1slam_ros.core.graph.growable_array import GrowingArray
 WORLD = -1
 # In the place of a predecessor: the keyframe is the first of a part.
 NO_PREDECESSOR = -1
+# In the place of a robot's number: the pose is of a landmark.
+LANDMARK = int(np.iinfo(np.int64).min)
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ class FactorGraph:
 
     A keyframe has a robot, and a predecessor: the keyframe from which the odometry of that robot
     leads to it, which was there before it; or none. Nothing else is said by its index: keyframes
-    of several robots come in any order.
+    of several robots come in any order. A landmark is a pose where no robot was, see `landmarks`.
 
     Parameters
     ----------
@@ -153,6 +155,11 @@ class FactorGraph:
     def robot(self) -> Indices:
         """The number of the robot of each keyframe, (n,)."""
         return self._robot.view()
+
+    @property
+    def is_landmark(self) -> Mask:
+        """(n,) bool: the poses of landmarks."""
+        return np.asarray(self.robot == LANDMARK)
 
     def copy(self) -> 'FactorGraph':
         """Return a graph that shares all factors so far; either may grow without the other."""

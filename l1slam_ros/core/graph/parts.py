@@ -60,6 +60,7 @@ def vague_odometry(graph: FactorGraph) -> Mask:
     size = np.where(factors.speaks, np.log(np.maximum(diagonal, _TINY)), 0.0).sum(axis=1)
     odometry = factors.is_odometry
     vague = np.log(_VAGUE) * graph.manifold.TANGENT_SIZE
+    odometry = odometry & ~graph.is_landmark[factors.j]  # a sighting says where it is
     return odometry & (size < np.median(size[odometry]) - vague if odometry.any() else False)
 
 

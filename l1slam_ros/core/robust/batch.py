@@ -83,6 +83,7 @@ from l1slam_ros.core.robust.odometry.noisier import with_runs
 from l1slam_ros.core.robust.odometry.slips import without_slip
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds.growth import Growth
+from l1slam_ros.core.robust.rounds.landmarks import with_landmarks
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 from l1slam_ros.core.solvers.nonlinear import Solution
@@ -92,6 +93,7 @@ from l1slam_ros.core.solvers.optimality import Status, l1_cost
 _MOST_ROUNDS = 200
 
 
+@with_landmarks
 @as_measured
 def robust_solve(
     graph: FactorGraph, report: OnRound = lambda round_, accepted: None,

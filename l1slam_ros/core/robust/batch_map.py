@@ -22,6 +22,7 @@ import numpy as np
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+from l1slam_ros.core.graph.landmarks import by_first_sightings
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.parts import (
     bridged,
@@ -123,10 +124,8 @@ def solve(
     ids = np.arange(graph.n_poses) if ids is None else ids
     whole = graph
     graph = graph.without_struck()  # what is struck out is there for nobody
-    _require_start(graph, stored, asked, ids)
+    initial = _initial(graph, stored, asked, ids)
     seed = None
-    initial = (odometry_poses(graph) if asked.start == 'odometry'
-               else initial_poses(graph if asked.robust is False else bridged(graph), stored, ids))
     minimiser = _Minimiser(asked, report, on_choice)
     began = time.perf_counter()
     robust, unjudged = _robust_map(graph, asked, minimiser, on_round, ids)
@@ -234,6 +233,18 @@ def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Arr
                          for one in np.ascontiguousarray(b.T)], axis=1)
 
     return lacked_step(part, is_loop, system.b, np.ones(2), left_of)
+
+
+def _initial(graph: FactorGraph, stored: Array | None, asked: SolveOptions,
+             ids: Indices) -> Array:
+    """Return the poses to start from, or to take the initial cost at, (n, p)."""
+    way, number = by_first_sightings(graph)
+    order = np.argsort(number)
+    _require_start(way, stored, asked, ids[order])
+    if asked.start == 'odometry':
+        return odometry_poses(way)[number]
+    return initial_poses(way if asked.robust is False else bridged(way),
+                         None if stored is None else stored[order], ids[order])[number]
 
 
 def _require_start(graph: FactorGraph, stored: Array | None, asked: SolveOptions,

@@ -99,7 +99,9 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     manifold = graph.manifold
     low, high, Z = ends_in_time(graph)
     positions = manifold.positions(chain)
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    # A landmark is where the way is that it is seen from.
+    on_way = np.where(graph.is_landmark[:, None], positions[graph.parent], positions)
+    steps = np.linalg.norm(np.diff(on_way, axis=0), axis=1)
     # The world is where the way begins, as WORLD finds it: last.
     way = np.concatenate(([0.0], np.cumsum(steps), [0.0]))
     near = max(NEAR, _NEAR_STEPS * float(np.median(steps)) if len(steps) else 0.0)

@@ -24,6 +24,7 @@ from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask, distinct, square_root_information
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
+from l1slam_ros.core.graph.landmarks import mark_landmarks
 from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.io.files import (
@@ -211,6 +212,8 @@ def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, e
                remarks: Remarks, struck_here: Mask) -> None:
     i, j = _index(path, ids, edges).T
     i, none = np.where(edges.alone, WORLD, i), np.zeros(len(edges), bool)
+    if not remarks:  # all poses of a saved map are of robots
+        mark_landmarks(graph, ids, i, j)
     roots = roots_of(path, edges)
     doubted = BetweenFactors(i, j, edges.pose, roots, none, none, graph.predecessor)
     trusted, struck = (remarks['trusted'], remarks['struck']) if remarks else (

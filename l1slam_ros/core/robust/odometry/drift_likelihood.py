@@ -113,10 +113,10 @@ class _DriftLikelihood:
         low, high, measured = ends_in_time(graph)
         low, high, measured = low[rows], high[rows], measured[rows]
         factors = graph.between
-        steps = np.flatnonzero(factors.is_odometry)
+        steps = np.flatnonzero(factors.is_odometry & ~graph.is_landmark[factors.j])
         covariance = covariance_of(factors.sqrt_information)
         way, noise = np.zeros(graph.n_poses), np.zeros((graph.n_poses, 2))
-        at = np.minimum(factors.i, factors.j)[steps] + 1
+        at = np.maximum(factors.i, factors.j)[steps]
         way[at] = np.hypot(*factors.measurement[steps, :2].T)
         noise[at] = np.stack((np.trace(covariance[steps, :2, :2], axis1=1, axis2=2) / 2,
                               covariance[steps, 2, 2]), axis=1)

@@ -80,7 +80,7 @@ def steps_of(growth: Growth, rows: Indices) -> Array:
 
 def usual_motion(growth: Growth) -> Motion:
     """Return how the robot moves by its odometry."""
-    step = steps_of(growth, np.flatnonzero(~growth.given.is_loop & ~growth.cut))
+    step = steps_of(growth, np.flatnonzero(growth.given.is_step & ~growth.cut))
     least = np.diag(SAME**2 * (step**2).mean(axis=0) + TINY)
     translation = growth.given.graph.manifold.TRANSLATION
     width = np.full(len(least), np.pi**2 / 3)
@@ -118,7 +118,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     manifold = given.graph.manifold
     factors = given.factors
     k = manifold.TANGENT_SIZE
-    rows = np.flatnonzero(~given.is_loop & ~given.gap & (factors.freedom == k))
+    rows = np.flatnonzero(given.is_step & ~given.gap & (factors.freedom == k))
     at = np.searchsorted(np.flatnonzero(growth.accepted), rows)
     R, r = growth.posterior.moment[at], growth.posterior.residual[at]
     inverse = np.linalg.inv(R + TINY * np.eye(k))

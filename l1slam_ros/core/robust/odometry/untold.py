@@ -75,7 +75,7 @@ def shown_slips(growth: Growth, motion: Motion) -> Shown:
     cuts = np.append(0, np.cumsum(spanned(given.low[growth.cut], given.high[growth.cut], n)))
     tell = loops[cuts[given.low[loops]] == cuts[given.high[loops]]]
     across = spanned(given.low[tell], given.high[tell], n)
-    steps = np.flatnonzero(~given.is_loop & ~growth.cut)
+    steps = np.flatnonzero(given.is_step & ~growth.cut)
     steps = steps[across[given.low[steps]] < FEWEST_PLACES]
     if not len(rows) or not len(steps):
         return rows, steps, np.zeros((0, len(steps)))

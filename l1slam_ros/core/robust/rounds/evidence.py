@@ -74,6 +74,11 @@ class Evidence:
         """(m,) the later keyframe of each factor."""
         return self.factors.j
 
+    @property
+    def is_step(self) -> Mask:
+        """(m,) bool: the odometry of robots, not the sightings that place landmarks."""
+        return np.asarray(~self.is_loop & ~self.graph.is_landmark[self.high])
+
     def spanning(self, step: int) -> Mask:
         """Return which loops span an odometry factor, (m,) bool."""
         span: Mask = self.is_loop & (self.low < self.high[step]) & (self.high > self.low[step])
