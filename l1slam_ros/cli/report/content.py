@@ -81,7 +81,7 @@ _UNSETTLED = NORM, FAILED, UNSOLVED
 
 
 def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
-            rivals: Sequence[Rival], remarks: Sequence[str]) -> dict[str, Any]:
+            rivals: Sequence[Rival], cost_name: str, remarks: Sequence[str]) -> dict[str, Any]:
     """
     Return what the page shows, as JSON has it; loops and keyframes by their numbers, from 0.
 
@@ -89,6 +89,7 @@ def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
     ----------
     path : of the input
     norm : as it was asked for; None: the default
+    cost_name : what the cost of the map is called
     remarks : sentences that were said besides
 
     """
@@ -118,7 +119,7 @@ def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
         'i': factors.pairs[rows, 0].tolist(), 'j': factors.pairs[rows, 1].tolist(),
         'said': said[rows].tolist(), 'loops': len(rows) - len(slips),
         'fates': [dict(zip(('word', 'reason', 'unknown'), fate, strict=True)) for fate in _FATES],
-        'maps': _maps(record, outcome, rivals, rows),
+        'maps': _maps(record, outcome, rivals, rows, cost_name),
         'files': _files(path, name, norm, record,
                         any(doubt.kind == NORM for doubt in doubts)),
     }
@@ -142,12 +143,13 @@ def _counted_doubts(judgement: Judgement) -> str:
 
 
 def _maps(record: GraphRecord, outcome: Outcome, rivals: Sequence[Rival],
-          rows: Indices) -> list[dict[str, Any]]:
+          rows: Indices, cost_name: str) -> list[dict[str, Any]]:
     """Return the map that was solved and its rivals: name, note, positions, fates, sigmas."""
     positions = record.graph.manifold.positions
     first = positions(outcome.solution.poses)
     fate, sigmas = _fates(record.graph, outcome.judgement)
-    maps = [('the map', _used(outcome, fate), -1, first, fate, sigmas)]
+    note = f'{_used(outcome, fate)}, {cost_name} {outcome.solution.cost:.6g}'
+    maps = [('the map', note, -1, first, fate, sigmas)]
     for rival in rivals:
         other = positions(rival.outcome.solution.poses)
         judgement = rival.outcome.judgement

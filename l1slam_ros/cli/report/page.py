@@ -55,11 +55,11 @@ def check_report(path: Path, read: Sequence[Path], force: bool) -> None:
 
 
 def write_report(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
-                 asked: SolveOptions, remarks: Sequence[str]) -> None:
+                 asked: SolveOptions, cost_name: str, remarks: Sequence[str]) -> None:
     """Solve for the rivals of a map, and write the page; remarks : sentences said besides."""
     with Progress(None, 'map', arguments.quiet, 'solving for rivals') as progress:
         rivals = rival_maps(record, outcome, asked, lambda name: progress.advance(1, name))
-    shown = content(arguments.input, arguments.norm, record, outcome, rivals, remarks)
+    shown = content(arguments.input, arguments.norm, record, outcome, rivals, cost_name, remarks)
     with replacing(arguments.report) as temporary:
         temporary.write_text(page(shown), encoding='utf-8')
 
