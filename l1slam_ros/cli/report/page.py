@@ -14,6 +14,7 @@ one ticks a loop stands in `page.html`, which this puts the library and the cont
 """
 
 import argparse
+import hashlib
 import json
 from collections.abc import Sequence
 from importlib.resources import files
@@ -71,6 +72,8 @@ def page(shown: dict[str, Any]) -> str:
     template = files(__package__).joinpath('page.html').read_text(encoding='utf-8')
     begin, between = template.split(_CONTENTS)
     between, end = between.split(_LIBRARY)
+    # What is ticked in a page is kept in the browser for pages that show the same.
+    key = hashlib.sha256(json.dumps(shown).encode()).hexdigest()
     # Whatever a file is called ends no script.
-    data = json.dumps(shown, separators=(',', ':')).replace('<', '\\u003c')
+    data = json.dumps({**shown, 'key': key}, separators=(',', ':')).replace('<', '\\u003c')
     return ''.join((REPORT_MARK, '\n', begin, data, between, get_plotlyjs(), end))
