@@ -257,12 +257,13 @@ def test_the_rival_of_a_map_with_a_named_slip_is_shown_to_its_last_row(capsys, t
     found, complaints = opened(page, f"""{HEAD} {PRESS}
         const fates = () => {{
           const all = [];
-          for (;;) {{
+          for (let page = 0; page < 9; page++) {{
             all.push(...[...document.querySelectorAll('#rows tr')].map(
               row => row.cells[2].textContent));
-            if (document.getElementById('next').disabled) return all;
+            if (document.getElementById('next').disabled) break;
             press('Next');
           }}
+          return all;
         }};
         const map = () => document.getElementById('map').data.find(
           one => one.name === 'keyframes').x.slice();
@@ -435,6 +436,14 @@ def test_a_page_is_written_whole_or_not_at_all(capsys, tmp_path, monkeypatch):
     err = run(capsys, 'solve', path, '--report', page, '--quiet', code=2)[1]
     assert 'No space left' in err and page.read_bytes() == before
     assert sorted(one.name for one in tmp_path.iterdir()) == ['map.html', 'ring.g2o']
+
+
+def test_a_browser_that_is_missing_is_a_failure_where_a_change_is_tried(tmp_path, monkeypatch):
+    monkeypatch.setenv('PATH', str(tmp_path))
+    for word, ends in ('1', pytest.fail.Exception), ('', pytest.skip.Exception):
+        monkeypatch.setenv('CI', word)
+        with pytest.raises(ends, match='no browser is installed here; expected one of chromium,'):
+            browser()
 
 
 @pytest.mark.parametrize('name', ['</script><b>.g2o', "a'b c.g2o"])
