@@ -19,9 +19,9 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch_map import Outcome
-from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.io import formats
-from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.graphs.graph_file import GraphRecord, left_out_words
+from l1slam_ros.io.graphs.left_out import SUSPECT, left_out_by
 from l1slam_ros.io.graphs.side_files import beside
 from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.plot import Curve, MapDrawing, check_picture, plot_maps, plot_solution
@@ -38,7 +38,7 @@ def plot(arguments: argparse.Namespace) -> Ending:
             poses = formats.stored_poses(record)
         known = beside(path, 'truth')
         truth = read_truth(str(known), record, path) if known.exists() else None
-        drawings.append(_drawing(path, record, poses, truth, 'poses'))
+        drawings.append(_drawing(path, record, poses, truth, 'poses', left_out_words(record)))
         damages.append(record.damage)
     plot_maps(arguments.output, drawings)
     return Ending('; '.join(filter(None, damages)))
@@ -46,24 +46,28 @@ def plot(arguments: argparse.Namespace) -> Ending:
 
 def plot_outcome(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
                  truth: Truth | None, cost_name: str) -> None:
-    """Draw the map of a solve, and beside it its costs."""
-    costs = outcome.solution.history
-    named = {'initial': outcome.initial_cost, 'seed': outcome.seed_cost, 'final': costs[-1]}
+    """Draw the map of a solve, and beside it its costs, where these are of the stated noise."""
+    costs, final = outcome.solution.history, outcome.solution.cost
+    drawing = _drawing(arguments.input, record, outcome.solution.poses, truth, 'optimised',
+                       left_out_by(outcome.judgement, record.graph.between),
+                       f'{cost_name} {final:.6g}')
+    if not np.isclose(costs[-1], final):  # by the noise that was estimated
+        plot_maps(arguments.plot, [drawing])
+        return
+    named = {'initial': outcome.initial_cost, 'seed': outcome.seed_cost, 'final': final}
     plot_solution(
-        arguments.plot, _drawing(arguments.input, record, outcome.solution.poses, truth,
-                                 'optimised', f'{cost_name} {costs[-1]:.6g}', outcome.judgement),
-        Curve(cost_name, np.arange(len(costs), dtype=float), costs),
+        arguments.plot, drawing, Curve(cost_name, np.arange(len(costs), dtype=float), costs),
         ', '.join(f'{name} {cost:.6g}' for name, cost in named.items() if cost is not None))
 
 
 def _drawing(path: Path, record: GraphRecord, poses: Array, truth: Truth | None,
-             name: str, note: str = '', judgement: Judgement | None = None) -> MapDrawing:
+             name: str, left_out: np.ndarray, note: str = '') -> MapDrawing:
     """
     Return the map of poses (n, p), with its odometry, and the path of the truth if known.
 
-    name : what the poses are. The odometry sets out from the first of them. Loops that are not
-    accepted are drawn as refused or as suspect; of those that are, the ones that the file of false
-    loops beside the input `path` names, as false.
+    name : what the poses are. The odometry sets out from the first of them. Loops that the map
+    leaves out, by the words (m,) of `left_out`, are drawn as refused or as suspect; of the others,
+    the ones that the file of false loops beside the input `path` names, as false.
     """
     graph = record.graph
     factors = graph.between
@@ -76,12 +80,10 @@ def _drawing(path: Path, record: GraphRecord, poses: Array, truth: Truth | None,
         odometry = None
     false = known_false(path, record)
     is_loop = ~factors.is_odometry
-    kept, suspect = np.ones(len(factors), bool), np.zeros(len(factors), bool)
-    if judgement is not None:
-        kept, suspect = judgement.accepted, judgement.suspect
+    kept, suspect = left_out == '', left_out == SUSPECT
     pairs = factors.pairs
     return MapDrawing(
         path.name, positions(poses), odometry,
         true_path(record, poses, truth) if truth else None, pairs[is_loop & kept & ~false],
-        suspect=pairs[suspect], rejected=pairs[is_loop & ~kept & ~suspect],
+        suspect=pairs[is_loop & suspect], rejected=pairs[is_loop & ~kept & ~suspect],
         false=pairs[false & kept], name=name, note=note)

@@ -41,6 +41,7 @@ from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.sentences import (
     DOUBTFUL,
+    WITHOUT,
     doubt_reasons,
     doubt_sentence,
     doubted,
@@ -106,8 +107,8 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
     if arguments.report:
         from l1slam_ros.cli.report.page import write_report
 
-        write_report(arguments, record, outcome, asked, [*warnings, *remarks, *filter(
-            None, [record.damage])])
+        write_report(arguments, record, outcome, asked, _cost_name(asked),
+                     [*warnings, *remarks, *filter(None, [record.damage])])
     if arguments.json:
         # What is not finite has no place in JSON.
         print(json.dumps({name: None if isinstance(value, float) and not math.isfinite(value)
@@ -167,8 +168,10 @@ def _outcome(arguments: argparse.Namespace, record: GraphRecord, asked: SolveOpt
     with (formats.named(arguments.input),
           Progress(None, 'round', quiet, 'judging loops') as judging,
           Progress(steps, 'step', quiet, 'solving') as solving):
+        # Judged loops are weighed by the noise that was found: that cost is no cost of the map.
         return solve_graph(
-            record.graph, record.poses, asked, solving.report,
+            record.graph, record.poses, asked,
+            solving.report if asked.robust is False else lambda *_: solving.advance(),
             lambda _, accepted: judging.advance(1, f'{counted(accepted, "loop")} believed'),
             record.ids, lambda method: _announce(method, quiet))
 
@@ -280,7 +283,9 @@ def _print_report(report: dict[str, object], record: GraphRecord, cost_name: str
     struck = f', {factors.struck.sum():,} struck out' if factors.struck.any() else ''
     print(f'{counted(len(solution.poses), "pose")}, {counted(len(factors), "factor")}, '
           f'{doubted(factors)}{struck}')
-    print(f'{cost_name}: initial {outcome.initial_cost:.6g}, {seed}final {solution.cost:.6g}')
+    left_out = (left_out_by(outcome.judgement, factors) != '') & ~factors.struck
+    print(f'{cost_name}: initial {outcome.initial_cost:.6g}, {seed}final {solution.cost:.6g}'
+          f'{WITHOUT if left_out.any() else ""}')
     inner = f', {counted(solution.inner_iterations, "inner one")}' if (
         solution.inner_iterations) else ''
     print(f'{solution.status.value.replace("_", " ")} ({SENTENCES[solution.status]}): '

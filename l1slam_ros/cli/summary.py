@@ -17,14 +17,15 @@ import numpy as np
 
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.parts import connected_parts, odometry_gaps
 from l1slam_ros.core.names import ANGLE, QUATERNION
 from l1slam_ros.core.robust import inspection
 from l1slam_ros.core.robust.places import first_told
 from l1slam_ros.io.files import NANOSECONDS, counted, stamp_text
-from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.graphs.graph_file import GraphRecord, left_out_words
 from l1slam_ros.io.graphs.robots import robot_names, robots_of
-from l1slam_ros.io.sentences import offset_sentence
+from l1slam_ros.io.sentences import WITHOUT, offset_sentence
 
 # A reading of the rotations' information fits where their errors are as large as it says, to this
 # logarithm: half of what it is to the other reading.
@@ -54,16 +55,18 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
     factors = graph.between
     absolute = int(factors.is_absolute.sum())
     is_loop = ~factors.is_odometry & ~factors.is_absolute
+    believed = record.believed
     parallel = int(is_loop[inspection.parallel_factors(graph)].sum())
     beside = f', {parallel:,} of them beside another edge' if parallel else ''
-    out = int(is_loop[factors.struck].sum())
-    struck = f', {out:,} of them struck out' if out else ''
+    left_out = left_out_words(record) != ''
+    without = (_counted_out(is_loop & left_out & ~factors.struck, 'left out by the map'),
+               _counted_out(is_loop & factors.struck, 'struck out'))
     length = inspection.step_lengths(graph).sum()
     rows = [
         ('poses', f'{graph.n_poses:,} in {graph.manifold.NAME}, ids {ids[0]} to {ids[-1]}'),
         ('odometry', f'{int(factors.is_odometry.sum()):,}, {length:,.1f} m'),
-        ('loops', f'{int(is_loop.sum()):,}{beside}{struck}'),
-        ('components', f'{len(connected_parts(graph)):,}')]
+        ('loops', f'{int(is_loop.sum()):,}{beside}{"".join(without)}'),
+        ('components', f'{len(connected_parts(believed)):,}')]
     landmarks = int(graph.is_landmark.sum())
     if landmarks:
         rows.insert(1, ('landmarks', f'{landmarks:,} of the poses; each edge to one is a loop'))
@@ -81,17 +84,25 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
     if record.stamps is not None:
         rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
     if record.poses is not None:
-        cost = inspection.cost_at(graph.without_struck(), record.poses)
-        rows.append(('l1 cost', f'{cost:.6g} at the stored poses'))
+        cost = inspection.cost_at(believed, record.poses)
+        some = WITHOUT if (left_out & ~factors.struck).any() else ''
+        rows.append(('l1 cost', f'{cost:.6g} at the stored poses{some}'))
     return rows
 
 
+def _counted_out(some: Mask, how: str) -> str:
+    """Return a clause on how many loops of (m,) bool are out of the map, empty for none."""
+    return f', {int(some.sum()):,} of them {how}' if some.any() else ''
+
+
 def complaints(record: GraphRecord) -> list[str]:
-    """Return a sentence on each thing that looks wrong with a graph but for what is struck out."""
-    record = replace(record, graph=record.graph.without_struck())
-    checks: tuple[Callable[[GraphRecord], Iterator[str]], ...] = (
-        _on_ids, _on_parts, _on_gaps, _on_repetitions, _on_steps, _on_noise)
-    return [sentence for check in checks for sentence in check(record)]
+    """Return a sentence on each thing that looks wrong with a graph but for what is left out."""
+    believed = replace(record, graph=record.believed)
+    given = replace(record, graph=record.graph.without_struck())
+    checks: tuple[tuple[Callable[[GraphRecord], Iterator[str]], GraphRecord], ...] = (
+        (_on_ids, given), (_on_parts, believed), (_on_gaps, given), (_on_repetitions, given),
+        (_on_steps, given), (_on_noise, believed))
+    return [sentence for check, of in checks for sentence in check(of)]
 
 
 def _on_ids(record: GraphRecord) -> Iterator[str]:

@@ -100,7 +100,7 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
                                      np.stack((loops.i, loops.j), axis=1)))
     # All its loops are to be doubted again; comments stand between others now.
     spoiled = formats.with_poses(replace(record, graph=insert_loops(record.graph, loops),
-                                         left_out=None, comments=(), log=None))
+                                         left_out=None, comments=(), drift=0.0, log=None))
     # A bag has no vertex ids: read back, it counts its keyframes from 0.
     ids = record.ids[pairs] if arguments.output.suffix else pairs
     with formats.named(arguments.input):

@@ -80,6 +80,7 @@ class _Origin(NamedTuple):
     left_out: np.ndarray | None = None
     comments: tuple[tuple[int, str], ...] = ()
     log: RobotLog | None = None
+    drift: float = 0.0
 
 
 # For each graph that `read_graph` returned, what `write_graph` writes besides.
@@ -268,7 +269,7 @@ def read_graph(path: str | os.PathLike[str], *, odom_topic: str = DEFAULT_TOPICS
     for sentence in filter(None, (*record.skipped, record.damage)):
         warnings.warn(sentence, stacklevel=2)
     _ORIGINS[record.graph] = _Origin(record.ids, record.stamps, record.left_out, record.comments,
-                                     record.log)
+                                     record.log, record.drift)
     return record.graph, record.poses
 
 
@@ -321,6 +322,7 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
         left_out = left_out_of(np.asarray(inliers, bool), factors)
     elif left_out is not None:  # factors appended since are used
         left_out = np.concatenate((left_out, nothing_left_out(len(factors) - len(left_out))))
+        drift = origin.drift
     write_output(Path(path), GraphRecord(
         graph, poses, origin.ids, origin.stamps, left_out=left_out,
         rotation_information=rotation_information, comments=origin.comments, drift=drift,

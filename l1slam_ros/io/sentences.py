@@ -38,6 +38,8 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord
 
 # The status of a map that is not to be relied on.
 DOUBTFUL = 'doubtful'
+# Behind a cost that counts the factors of the map alone.
+WITHOUT = ', without what is left out'
 
 # Number of loops that are named one by one; `--json` lists all.
 _NAMED = 20

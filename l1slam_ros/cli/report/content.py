@@ -11,7 +11,7 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from l1slam_ros.core.robust.judgement import (
     Judgement,
 )
 from l1slam_ros.io import formats
-from l1slam_ros.io.files import counted
+from l1slam_ros.io.files import counted, stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import beside
 from l1slam_ros.io.sentences import DOUBTFUL, doubt_reasons, doubted, doubted_rows
@@ -53,8 +53,10 @@ _FATES = (
      'is odometry that the loops contradict: left out'),
     ('trusted', 'is vouched for, so never refused; {} sigmas off the map',
      'is vouched for, so never refused'),
-    ('struck', 'was struck out, so not used', 'was struck out, so not used'))
-_ACCEPTED, _REJECTED, _SUSPECT, _SLIP, _TRUSTED, _STRUCK = range(len(_FATES))
+    ('struck', 'was struck out, so not used', 'was struck out, so not used'),
+    ('odometry', 'is odometry that is in this map, {} sigmas off it',
+     'is odometry that is in this map'))
+_ACCEPTED, _REJECTED, _SUSPECT, _SLIP, _TRUSTED, _STRUCK, _ODOMETRY = range(len(_FATES))
 
 _LOOK = 'Look at the images or scans of a few of them'
 # What a person can do about a doubt, by its kind.
@@ -83,7 +85,7 @@ _UNSETTLED = NORM, NO_WHEELS, FAILED, UNSOLVED
 
 
 def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
-            rivals: Sequence[Rival], remarks: Sequence[str]) -> dict[str, Any]:
+            rivals: Sequence[Rival], cost_name: str, remarks: Sequence[str]) -> dict[str, Any]:
     """
     Return what the page shows, as JSON has it; loops and keyframes by their numbers, from 0.
 
@@ -91,12 +93,14 @@ def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
     ----------
     path : of the input
     norm : as it was asked for; None: the default
+    cost_name : what the cost of the map is called
     remarks : sentences that were said besides
 
     """
     factors = record.graph.between
     judgement = outcome.judgement
-    slips = judgement.slips if judgement else np.zeros(0, np.int64)
+    maps = _maps(record, outcome, rivals, cost_name)
+    slips = np.flatnonzero(np.any([one.fate == _SLIP for one in maps], axis=0))
     rows = np.concatenate((np.flatnonzero(~factors.is_odometry), slips))
     doubts = judgement.doubts if judgement else ()
     number_of = np.full(len(factors), -1)
@@ -116,11 +120,13 @@ def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
         'remarks': list(remarks),
         # As text: JavaScript's numbers do not hold 64 bits.
         'ids': [str(name) for name in record.ids.tolist()],
+        'stamps': [] if record.stamps is None else [
+            stamp_text(stamp) for stamp in record.stamps.tolist()],
         'path': _path(record.graph),
         'i': factors.pairs[rows, 0].tolist(), 'j': factors.pairs[rows, 1].tolist(),
         'said': said[rows].tolist(), 'loops': len(rows) - len(slips),
         'fates': [dict(zip(('word', 'reason', 'unknown'), fate, strict=True)) for fate in _FATES],
-        'maps': _maps(record, outcome, rivals, rows),
+        'maps': _drawn(maps, rows),
         'files': _files(path, name, norm, record,
                         any(doubt.kind == NORM for doubt in doubts)),
     }
@@ -143,31 +149,47 @@ def _counted_doubts(judgement: Judgement) -> str:
     return f'there {"is one doubt" if count == 1 else f"are {count} doubts"}'
 
 
+class _Map(NamedTuple):
+    """One map: (n, k) positions; the fate of each factor of the file and its sigmas, (m,)."""
+
+    name: str
+    note: str
+    doubt: int
+    positions: Array
+    fate: Indices
+    sigmas: Array
+
+
 def _maps(record: GraphRecord, outcome: Outcome, rivals: Sequence[Rival],
-          rows: Indices) -> list[dict[str, Any]]:
-    """Return the map that was solved and its rivals: name, note, positions, fates, sigmas."""
+          cost_name: str) -> list[_Map]:
+    """Return the map that was solved and its rivals."""
     positions = record.graph.manifold.positions
     first = positions(outcome.solution.poses)
     fate, sigmas = _fates(record.graph, outcome.judgement)
-    maps = [('the map', _used(outcome, fate), -1, first, fate, sigmas)]
+    note = f'{_used(outcome, fate)}, {cost_name} {outcome.solution.cost:.6g}'
+    maps = [_Map('the map', note, -1, first, fate, sigmas)]
     for rival in rivals:
         other = positions(rival.outcome.solution.poses)
-        judgement = rival.outcome.judgement
-        if judgement is not None:
-            fate_there, sigmas_there = _fates(rival.graph, judgement)
-        elif len(rival.graph.between) == len(record.graph.between):
-            fate_there, sigmas_there = _fates(rival.graph, None)
+        if rival.used.all():
+            fate_there, sigmas_there = _fates(rival.graph, rival.outcome.judgement)
         else:  # of the same loops, but for one step
-            fate_there, sigmas_there = fate, sigmas
-        maps.append((f'rival: {rival.name}', _note(rival, first, other, fate_there), rival.doubt,
-                     other, fate_there, sigmas_there))
-    digits = _digits(first)
-    return [{'name': name, 'note': note, 'doubt': doubt,
-             'at': [axis.round(digits).tolist() for axis in place.T],
-             'fate': fate[rows].tolist(),
-             'sigmas': [None if not np.isfinite(one) else round(one, 2)
-                        for one in sigmas[rows].tolist()]}
-            for name, note, doubt, place, fate, sigmas in maps]
+            odometry = np.where(rival.used, _ODOMETRY, _SLIP)
+            fate_there = np.where(record.graph.between.is_odometry, odometry, fate)
+            sigmas_there = np.where(fate_there == fate, sigmas, np.nan)
+        maps.append(_Map(f'rival: {rival.name}', _note(rival, first, other, fate_there),
+                         rival.doubt, other, fate_there, sigmas_there))
+    return maps
+
+
+def _drawn(maps: Sequence[_Map], rows: Indices) -> list[dict[str, Any]]:
+    """Return maps as JSON has them, with some of the factors."""
+    digits = _digits(maps[0].positions)
+    return [{'name': one.name, 'note': one.note, 'doubt': one.doubt,
+             'at': [axis.round(digits).tolist() for axis in one.positions.T],
+             'fate': one.fate[rows].tolist(),
+             'sigmas': [None if not np.isfinite(sigmas) else round(sigmas, 2)
+                        for sigmas in one.sigmas[rows].tolist()]}
+            for one in maps]
 
 
 def _note(rival: Rival, first: Array, other: Array, fate: Indices) -> str:
@@ -184,9 +206,9 @@ def _used(outcome: Outcome, fate: Indices) -> str:
 
 
 def _fates(graph: FactorGraph, judgement: Judgement | None) -> tuple[Indices, Array]:
-    """Return the fate of each factor, (m,), -1 of odometry in its place; and its sigmas, (m,)."""
+    """Return the fate of each factor, (m,), and its sigmas, (m,)."""
     factors = graph.between
-    fate = np.where(factors.is_odometry, -1, _ACCEPTED)
+    fate = np.where(factors.is_odometry, _ODOMETRY, _ACCEPTED)
     sigmas = np.full(len(factors), np.nan)
     if judgement is not None:
         sigmas = judgement.sigmas

@@ -14,6 +14,7 @@ one ticks a loop stands in `page.html`, which this puts the library and the cont
 """
 
 import argparse
+import hashlib
 import json
 from collections.abc import Sequence
 from importlib.resources import files
@@ -55,11 +56,11 @@ def check_report(path: Path, read: Sequence[Path], force: bool) -> None:
 
 
 def write_report(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
-                 asked: SolveOptions, remarks: Sequence[str]) -> None:
+                 asked: SolveOptions, cost_name: str, remarks: Sequence[str]) -> None:
     """Solve for the rivals of a map, and write the page; remarks : sentences said besides."""
     with Progress(None, 'map', arguments.quiet, 'solving for rivals') as progress:
         rivals = rival_maps(record, outcome, asked, lambda name: progress.advance(1, name))
-    shown = content(arguments.input, arguments.norm, record, outcome, rivals, remarks)
+    shown = content(arguments.input, arguments.norm, record, outcome, rivals, cost_name, remarks)
     with replacing(arguments.report) as temporary:
         temporary.write_text(page(shown), encoding='utf-8')
 
@@ -71,6 +72,8 @@ def page(shown: dict[str, Any]) -> str:
     template = files(__package__).joinpath('page.html').read_text(encoding='utf-8')
     begin, between = template.split(_CONTENTS)
     between, end = between.split(_LIBRARY)
+    # What is ticked in a page is kept in the browser for pages that show the same.
+    key = hashlib.sha256(json.dumps(shown).encode()).hexdigest()
     # Whatever a file is called ends no script.
-    data = json.dumps(shown, separators=(',', ':')).replace('<', '\\u003c')
+    data = json.dumps({**shown, 'key': key}, separators=(',', ':')).replace('<', '\\u003c')
     return ''.join((REPORT_MARK, '\n', begin, data, between, get_plotlyjs(), end))

@@ -25,6 +25,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions, solve
@@ -50,12 +51,17 @@ _MOST = 3
 
 @dataclass(frozen=True)
 class Rival:
-    """Another map: what was decided otherwise; the doubt's number; graph solved; what came out."""
+    """
+    Another map: what was decided otherwise; the doubt's number; graph solved; what came out.
+
+    used : (m,) bool, the factors of the graph of the file that the one solved is of
+    """
 
     name: str
     doubt: int
     graph: FactorGraph
     outcome: Outcome
+    used: Mask
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,7 @@ class _Plan:
     doubt: int
     graph: FactorGraph
     asked: SolveOptions
+    used: Mask | None = None
 
 
 def rival_maps(record: GraphRecord, outcome: Outcome, asked: SolveOptions,
@@ -81,7 +88,9 @@ def rival_maps(record: GraphRecord, outcome: Outcome, asked: SolveOptions,
                 found = solve(plan.graph, record.poses, plan.asked, ids=record.ids)
             except GraphError:
                 continue
-            rivals.append(Rival(plan.name, plan.doubt, plan.graph, found))
+            every = np.ones(len(record.graph.between), bool)
+            rivals.append(Rival(plan.name, plan.doubt, plan.graph, found,
+                                every if plan.used is None else plan.used))
     return rivals
 
 
@@ -128,4 +137,4 @@ def _of_step(record: GraphRecord, judgement: Judgement, doubt: Doubt, number: in
         word = 'with' if believed[rows[0]] else 'without'
         yield _Plan(f'{word} the step {step}', number,
                     judgement.corrected(record.graph).subset(
-                        believed, judgement.noise[believed]), believing)
+                        believed, judgement.noise[believed]), believing, believed)

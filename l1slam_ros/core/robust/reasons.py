@@ -182,7 +182,14 @@ def _may_have_slipped(growth: Growth, groups: list[Indices]) -> list[int]:
     told = [step for group in groups for step in common_steps(growth, group)]
     alone = -SURE if (growth.cut & ~growth.given.gap).any() else LEAST
     return [step for step, odds in growth.slip_odds.items()
-            if (odds < SURE if growth.cut[step] else odds > alone - SURE * (step in told))]
+            if (odds < SURE if growth.cut[step] else odds > alone - SURE * (step in told))
+            and not _is_vouched(growth, step)]
+
+
+def _is_vouched(growth: Growth, step: int) -> bool:
+    """Return whether all loops across a step are vouched for: they say where the robot went."""
+    across = growth.accepted & growth.given.spanning(step)
+    return bool(across.any() and growth.given.trusted[across].all())
 
 
 def _may_be_right(growth: Growth, group: Indices) -> bool:

@@ -26,7 +26,7 @@ from l1slam_ros.core.geometry.noise import Mask, distinct, square_root_informati
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.landmarks import mark_landmarks
 from l1slam_ros.core.names import QUATERNION
-from l1slam_ros.core.robust.odometry.drift import straightened
+from l1slam_ros.core.robust.odometry.drift import correction, straightened
 from l1slam_ros.io.files import (
     LARGEST,
     TextLines,
@@ -96,6 +96,11 @@ class GraphRecord:
         """The stamps [ns], (n,), invented where there are none."""
         return invented_stamps(self.graph.n_poses) if self.stamps is None else self.stamps
 
+    @property
+    def believed(self) -> FactorGraph:
+        """The factors that the stored map is made of: odometry corrected, nothing left out."""
+        return straightened(self.graph, self.drift).subset(left_out_words(self) == '')
+
 
 def read_graph_file(path: str | os.PathLike[str],
                     rotation_information: str = QUATERNION) -> GraphRecord:
@@ -146,8 +151,9 @@ def read_one_of_several(path: str | os.PathLike[str],
     inside: Mask = np.isin(edges.ids, ids).all(axis=1) | edges.alone
     edges, beyond = edges.chosen(inside), edges.chosen(~inside)
     order, left_out, as_measured = in_place(edges.lines, lines.left_out)
-    stand, edges = edges.lines[order], edges.chosen(as_measured)
+    stand, corrected, edges = edges.lines[order], edges.pose[order], edges.chosen(as_measured)
     _add_edges(path, graph, ids, edges, remarks, left_out == STRUCK)
+    changed = np.flatnonzero(order != as_measured)
     used = np.flatnonzero(left_out == '')
     ends = np.concatenate(([0], used + 1))
     before = ends[np.searchsorted(
@@ -156,7 +162,8 @@ def read_one_of_several(path: str | os.PathLike[str],
         graph, vertices.pose if len(vertices) else None, ids, _stamps(path, ids, remarks),
         (*said, *_skipped(groups, ids, anchors)),
         rotation_information=rotation_information, remarks=remarks, left_out=left_out,
-        comments=tuple(zip(before, (text for _, text in lines.comments), strict=True)))
+        comments=tuple(zip(before, (text for _, text in lines.comments), strict=True)),
+        drift=correction(graph.between, changed, corrected[changed]))
     return record, beyond
 
 

@@ -20,6 +20,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors
 from l1slam_ros.core.names import QUATERNION
+from l1slam_ros.core.robust.odometry.drift import correction
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.left_out import (
@@ -130,8 +131,9 @@ def read_jrl_file(path: Path, rotation_information: str = QUATERNION) -> GraphRe
     poses = None if missing else poses_of([start[key] for key in ids.tolist()], manifold)
     on_start = [f'initialization is not used: it lacks {len(missing):,} of '
                 f'{counted(len(ids), "key")}'] if start and missing else []
-    measurement = poses_of(factors.rows, manifold)
-    left_out = _left_out(root, letters, factors, measurement)
+    written = poses_of(factors.rows, manifold)
+    measurement = written.copy()
+    left_out, corrected = _left_out(root, letters, factors, measurement)
     roots, on_noise = roots_of([node['covariance'] for node in factors.nodes], manifold)
     graph = keyframes_of(ids, manifold)
     i, j = np.searchsorted(ids, keys).T
@@ -146,7 +148,8 @@ def read_jrl_file(path: Path, rotation_information: str = QUATERNION) -> GraphRe
     return GraphRecord(
         graph, poses, ids, times,
         (*factors.sentences(), *on_noise, *on_start, *on_times),
-        rotation_information=rotation_information, left_out=left_out, log=log)
+        rotation_information=rotation_information, left_out=left_out, log=log,
+        drift=correction(graph.between, corrected, written[corrected]))
 
 
 def read_truth(path: Path, manifold: Manifold) -> tuple[Indices, Array]:
@@ -267,12 +270,13 @@ def _named(node: Node, letters: dict[str, int], factors: _Factors,
 
 
 def _left_out(root: Node, letters: dict[str, int], factors: _Factors,
-              measurement: Array) -> np.ndarray:
-    """Return why each factor is left out, (m,); put back into place what was measured."""
+              measurement: Array) -> tuple[np.ndarray, Indices]:
+    """Return why each factor is left out, (m,), and of which what was measured is put back."""
     words = nothing_left_out(len(factors.nodes))
+    changed = list[int]()
     ours = root.find(OURS)
     if ours is None or factors.manifold is None:
-        return words
+        return words, np.array(changed, np.int64)
     if part := ours.find('left_out'):
         for row, (word,) in _named(part, letters, factors, 3):
             if word.text() not in (REJECTED, SUSPECT, SLIP, STRUCK):
@@ -281,4 +285,5 @@ def _left_out(root: Node, letters: dict[str, int], factors: _Factors,
     if part := ours.find('measured'):
         for row, (pose,) in _named(part, letters, factors, 3):
             measurement[row] = poses_of([row_of(pose, factors.manifold)], factors.manifold)[0]
-    return words
+            changed.append(row)
+    return words, np.array(changed, np.int64)

@@ -49,10 +49,21 @@ def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
 def corrected(factors: BetweenFactors, rows: Indices, drift: float) -> Array:
     """Return what some odometry factors in the plane measured, without its drift, (k, 3)."""
     measured = factors.measurement[rows]
-    along = np.where(factors.i[rows] < factors.j[rows], 1.0, -1.0)
     step = np.zeros((len(rows), 3))
-    step[:, 2] = drift * along * np.hypot(measured[:, 0], measured[:, 1])
+    step[:, 2] = drift * _way(factors, rows)
     return se2.retract(measured, step)
+
+
+def correction(factors: BetweenFactors, rows: Indices, made: Array) -> float:
+    """Return the drift [rad/m] for which `corrected` returns `made`, (k, 3); none: 0."""
+    turn, way = se2.local(factors.measurement[rows], made)[:, 2], _way(factors, rows)
+    return float(turn @ way / (way @ way)) if way.any() else 0.0
+
+
+def _way(factors: BetweenFactors, rows: Indices) -> Array:
+    """Return how far some odometry factors lead [m], (k,), below 0 of those backwards in time."""
+    along = np.where(factors.i[rows] < factors.j[rows], 1.0, -1.0)
+    return along * np.hypot(*factors.measurement[rows, :2].T)
 
 
 def drift_turn(factors: BetweenFactors, rows: Indices) -> Array:
