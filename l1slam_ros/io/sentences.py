@@ -72,12 +72,12 @@ _TOGETHER = ('the errors of loops of one place are correlated: each place counts
 _REASONS = {
     WEAK: 'the map may well be {detail} m off: with the noise that was estimated, the loops that '
           'are used allow that much; {count} are left out, {where}',
-    UNCONFIRMED: 'the odometry alone hardly confirms the {loops} in use, {where}: false ones '
-                 'could fit as well',
+    UNCONFIRMED: 'the odometry alone hardly confirms {loops} in use, {where}: false ones could '
+                 'fit as well',
     ONE_JOINS: 'two parts of the map are joined only by loops of one place ({loops}, {where}), '
                'which may be one mistake',
     OTHER_MAP: '{count} refused loops agree with each other on another map, {where}',
-    SLIP: 'the odometry may have slipped {where}, undecided by {loops} across it',
+    SLIP: 'the odometry may have slipped {where}: undecided by {loops} across it',
     DRIFTS: 'the odometry may turn by about {detail} rad per metre too much, {where}, undecided '
             'by the {loops} in use',
     UNFINISHED: 'the judgement of the loops did not come to an end: {loops} left out, '

@@ -58,7 +58,7 @@ import numpy as np
 
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
@@ -121,8 +121,8 @@ def robust_solve(
         for number, growth in enumerate(rounds(first, repair), 1):
             last = so_far(growth, repair.drift), growth.poses
             report(number, int(np.count_nonzero(growth.loops)))
-        growth.accept_uncontested()
-        reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival)
+        growth, uncontested = with_uncontested(growth)
+        reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival, uncontested)
         return judgement_of(growth, reasons, drift=repair.drift, odds=repair.odds), growth.poses
     except FAILURES as error:
         judgement, poses = known or last
@@ -313,6 +313,26 @@ def rounds(
                 found = None
         yield growth
     growth.accept_tail()
+
+
+def with_uncontested(growth: Growth) -> tuple[Growth, Indices]:
+    """
+    Return a state with the loops that are left out, where all fit the map and each other, (k,).
+
+    Then nothing is an outlier but by the prior: few loops against uncertain odometry, which false
+    ones would fit as well. The likelier map has them; that they are unconfirmed is a doubt.
+    """
+    given = growth.given
+    rows = np.flatnonzero(given.is_loop & ~growth.accepted)
+    if not len(rows) or growth.across()[rows].any() or (growth.cut & ~given.gap).any():
+        return growth, rows[:0]
+    found = growth.innovations(rows)
+    if (found.square >= given.gate(found.freedom)).any():
+        return growth, rows[:0]
+    state = growth.copy()
+    state.accepted[rows] = True
+    state.solve()
+    return (state, rows) if state.accepted[rows].all() else (growth, rows[:0])
 
 
 def judge(

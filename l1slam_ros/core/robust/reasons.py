@@ -36,6 +36,7 @@ from l1slam_ros.core.robust.judgement import (
 from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
 from l1slam_ros.core.robust.odometry.untold import LEAST
 from l1slam_ros.core.robust.pairwise_consistency import (
+    NONE,
     agree_at_a_place,
     longest_run,
     runs,
@@ -46,11 +47,13 @@ from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 
 
-def doubts(growth: Growth, ended: bool = True, rival: float = 0.0) -> tuple[Doubt, ...]:
+def doubts(growth: Growth, ended: bool = True, rival: float = 0.0,
+           uncontested: Indices = NONE) -> tuple[Doubt, ...]:
     """
     Return the reasons to doubt a map; none: ().
 
-    ended : nothing more can be accepted; rival : by how much more the odometry may drift [rad/m]
+    ended : nothing more can be accepted; rival : by how much more the odometry may drift [rad/m];
+    uncontested : (k,) see `batch.with_uncontested`
     """
     graph, size = growth.given.graph, growth.given.size
     loops = growth.given.is_loop[:size]
@@ -59,8 +62,10 @@ def doubts(growth: Growth, ended: bool = True, rival: float = 0.0) -> tuple[Doub
     reasons = []
     if not ended and len(left_out):
         reasons.append(doubt_of(graph, left_out, UNFINISHED))
-    if growth.uncontested.any() or _decides_alone(growth, accepted):
-        reasons.append(doubt_of(graph, accepted, UNCONFIRMED))
+    if not len(uncontested) and _decides_alone(growth, accepted):
+        uncontested = accepted
+    if len(uncontested):
+        reasons.append(doubt_of(graph, uncontested, UNCONFIRMED))
     if growth.given.gap.any():
         reasons += [doubt_of(graph, rows, ONE_JOINS) for rows in _joining_alone(growth)]
     agree = _agree(growth)

@@ -36,9 +36,10 @@ from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopOptions
+from l1slam_ros.core.robust import batch
 from l1slam_ros.core.robust.batch import judge
 from l1slam_ros.core.robust.judgement import NORM, Judgement
-from l1slam_ros.core.robust.rounds.growth import Growth
+from l1slam_ros.core.robust.pairwise_consistency import NONE
 from l1slam_ros.core.running.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.running.improve import improve, one_round, optimise
 from l1slam_ros.core.running.keeper import work
@@ -436,7 +437,7 @@ def test_a_loop_is_suspect_until_others_vouch_for_it(monkeypatch):
     a loop that came meanwhile needs no judgement.
     """
     # As while driving: at rest, loops that all fit are accepted with a doubt.
-    monkeypatch.setattr(Growth, 'accept_uncontested', lambda growth: None)
+    monkeypatch.setattr(batch, 'with_uncontested', lambda growth: (growth, NONE))
     backend, truth = Backend(EVERY), roundabout(220)
     drive_roundabout(backend, truth)
     settled(backend)

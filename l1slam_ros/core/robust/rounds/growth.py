@@ -58,10 +58,9 @@ class Growth:
     nothing: the gaps, and where it slipped; part : (n,) number of the part of each keyframe;
     poses : (n, p) the L2 map of the accepted; posterior : of these; noise : as it was found;
     slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
-    ventured : (m,) bool, loops of runs that noisier odometry explained; uncontested : (m,) bool,
-    see `accept_uncontested`; drops : (m,) how often each was accepted and did not fit; fits_found
-    : (m,) bool, not the loops that do not fit by the noise that was found; check : called before
-    long steps, raises where the work shall stop.
+    ventured : (m,) bool, loops of runs that noisier odometry explained; drops : (m,) how often
+    each was accepted and did not fit; fits_found : (m,) bool, not the loops that do not fit by the
+    noise that was found; check : called before long steps, raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -76,7 +75,7 @@ class Growth:
         self._order: ChangingOrder | None = None
         self.slip_odds: dict[int, float] = {}
         none = np.zeros(len(given.factors), bool)
-        self.ventured = self.uncontested = none
+        self.ventured = none
         self.fits_found = ~none
         self.drops = none.astype(np.int64)
 
@@ -235,26 +234,6 @@ class Growth:
         if len(tail):
             self.fits_found[tail] = True
             self.accept_more()
-
-    def accept_uncontested(self) -> None:
-        """
-        Accept the loops that are left out where all of them fit the map and each other.
-
-        Then nothing is an outlier but by the prior: few loops against uncertain odometry, which
-        false ones would fit as well. The likelier map has them; that they are unconfirmed is a
-        doubt.
-        """
-        rows = np.flatnonzero(self.given.is_loop & ~self.accepted)
-        if not len(rows) or self.across()[rows].any() or (self.cut & ~self.given.gap).any():
-            return
-        found = self.innovations(rows)
-        if (found.square >= self.given.gate(found.freedom)).any():
-            return
-        state = self.copy()
-        state.accepted[rows] = state.uncontested[rows] = True
-        state.solve()
-        if state.accepted[rows].all():
-            vars(self).update(vars(state))
 
     def learn_noise_anew(self) -> None:
         """Solve, and learn the noise of what is accepted now alone, again and again."""
