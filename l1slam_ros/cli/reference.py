@@ -89,7 +89,7 @@ def read_truth(source: str, record: GraphRecord, input_path: Path,
         stampless = reference.stamped and record.stamps is None
         hint = '; the graph has no stamps, so its poses are 0.1 s apart from 1000 s on'
         raise FileError(source, f'shares {counted(len(rows), "pose")} with the graph, expected '
-                        f'2 or more: it has {_interval(reference.keys, reference.stamped)}, the '
+                        f'2 or more; it has {_interval(reference.keys, reference.stamped)}, the '
                         f'graph {_interval(keys, reference.stamped)}{hint if stampless else ""}')
     scored = keys[rows]
     first, last = np.searchsorted(reference.keys, [scored.min(), scored.max()])

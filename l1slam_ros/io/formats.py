@@ -43,6 +43,7 @@ from l1slam_ros.io.files import require_file, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.graphs.left_out import left_out_of, nothing_left_out
 from l1slam_ros.io.graphs.robot_log import RobotLog
+from l1slam_ros.io.graphs.rows import begins_as_graph
 from l1slam_ros.io.graphs.side_files import BESIDE, WRITTEN_BESIDE, beside
 from l1slam_ros.io.jrl.document import cbor_library, is_cbor
 from l1slam_ros.io.jrl.layout import JRL_SUFFIXES
@@ -128,11 +129,19 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
 
 
 def graph_reader(path: Path) -> Callable[[Path, str, float | None], GraphRecord] | None:
-    """Return what reads a graph file of this name; None: it is none."""
+    """
+    Return what reads a graph file, by its name; None: it is none.
+
+    Raises
+    ------
+    FileError : it is a text file that cannot be read.
+
+    """
     # `map.g2o.1` is the previous map of the node.
     suffix = Path(unpacked_name(path).removesuffix('.1')).suffix
     # Some programs give their graphs the name of any text.
-    return read_graph_file if suffix == '.txt' else GRAPH_READERS.get(suffix)
+    is_text = path.suffix.lower() == '.txt' and begins_as_graph(path)
+    return read_graph_file if is_text else GRAPH_READERS.get(suffix)
 
 
 def is_bag(path: Path) -> bool:

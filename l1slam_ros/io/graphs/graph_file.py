@@ -223,9 +223,9 @@ def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, e
     doubted = BetweenFactors(i, j, edges.pose, roots, none, none, graph.predecessor)
     trusted, struck = (remarks['trusted'], remarks['struck']) if remarks else (
         named_loops(path, name, ids, doubted) for name in ('trusted', 'struck'))
-    struck = (struck & ~trusted) | struck_here
     true = trusted | loops_between(ids, doubted, vouched)
-    graph.append_between(i, j, edges.pose, roots, true & ~struck, struck)
+    graph.append_between(i, j, edges.pose, roots, true & ~struck & ~struck_here,
+                         (struck & ~trusted) | struck_here)
 
 
 def _index(path: object, ids: Indices, rows: Rows) -> Indices:

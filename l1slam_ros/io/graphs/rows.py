@@ -12,6 +12,7 @@ import math
 import os
 import re
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -26,11 +27,13 @@ from l1slam_ros.core.geometry.noise import (
     nearest_definite,
 )
 from l1slam_ros.core.names import QUATERNION
+from l1slam_ros.io.bounded import open_regular
 from l1slam_ros.io.files import (
     TextLines,
     counted,
     quoted,
     read_lines,
+    reported,
 )
 from l1slam_ros.io.graphs.left_out import restored
 from l1slam_ros.io.graphs.parsing import parse_rows, refuse_quaternions
@@ -52,6 +55,7 @@ _MATRICES = 'information matrices'
 # A tag of another program, and how many of them one sentence names.
 _TAG = re.compile('[A-Za-z][A-Za-z0-9_:]*')
 _TAGS_NAMED = 10
+_BEGIN = 2**16  # [bytes]
 # The begin of a line that may tie two vertices, as edges do.
 _TWO_IDS = re.compile(r'(-?[0-9]{1,18})\s+(-?[0-9]{1,18})(?=\s|$)')
 
@@ -103,6 +107,21 @@ class GraphLines:
     left_out: dict[int, tuple[str, int]]
     remarks: Remarks
     comments: tuple[tuple[int, str], ...]
+
+
+def begins_as_graph(path: Path) -> bool:
+    """
+    Tell whether one of the first lines of a file has a tag.
+
+    Raises
+    ------
+    FileError : it cannot be read, or is no regular file.
+
+    """
+    with reported(path, 'read'), open_regular(path) as file:
+        begin = file.read(_BEGIN)
+    return any(line.split(None, 1)[:1] == [tag.encode()]
+               for line in begin.splitlines() for tag in TAGS)
 
 
 def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
