@@ -70,6 +70,15 @@ def datasets():
     return folder
 
 
+@pytest.fixture(scope='session')
+def shared():
+    """Return the folder of inputs that are not part of the repository."""
+    folder = Path(__file__).parents[2] / 'shared'
+    if not folder.is_dir():
+        pytest.skip('the shared inputs are not on this machine')
+    return folder
+
+
 @pytest.fixture
 def ros():
     """Bring ROS up for one test and down after it; skip where there is none."""

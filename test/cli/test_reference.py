@@ -145,7 +145,8 @@ def test_a_graph_without_stamps_is_said_to_have_none(tmp_path):
     (tmp_path / 'truth.csv').write_text('5, 0, 0, 0\n6, 1, 0, 0\n')
     with pytest.raises(FileError, match='shares 0 poses with the graph, expected 2 or more; it '
                        r'has times from 5\.0+ to 6\.0+ s, the graph times from 1000\.0+ to '
-                       r'1008\.20+ s; the graph has no stamps, so its poses are 0.1 s apart from 1000 s on'):
+                       r'1008\.20+ s; the graph has no stamps, so its poses are 0.1 s apart from '
+                       '1000 s on'):
         read_truth(str(tmp_path / 'truth.csv'), record, Path('graph.g2o'))
 
 

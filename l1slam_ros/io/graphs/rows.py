@@ -327,12 +327,16 @@ def with_equivalents(path: object, groups: dict[str, TextLines],
     """
     lines = groups.get(EQUIVALENT, TextLines([], []))
     pairs = parse_rows(path, EQUIVALENT, lines, ids=2, values=0)[0]
-    joined = {tuple(pair) for pair in np.sort(edges.ids, axis=1).tolist()} if len(pairs) else set()
-    alone = np.array([tuple(sorted(pair)) not in joined and pair[0] != pair[1]
-                      for pair in pairs.tolist()], bool)
+    if not len(pairs):
+        return edges, pairs, []
+    joined = {tuple(pair) for pair in np.sort(edges.ids, axis=1).tolist()}
+    alone = np.zeros(len(pairs), bool)
+    for k, pair in enumerate(map(tuple, np.sort(pairs, axis=1).tolist())):
+        alone[k] = pair not in joined and pair[0] != pair[1]
+        joined.add(pair)
     count = int(alone.sum())
     said = [f'{counted(len(pairs), f"{EQUIVALENT} line")}: the loops between these vertices are '
-            'vouched for'] if len(pairs) else []
+            'vouched for']
     if not count:
         return edges, pairs, said
     said[0] += f'; {counted(count, "pair")} without an edge tied to each other'
