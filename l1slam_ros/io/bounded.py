@@ -110,7 +110,7 @@ def _blocks(path: Path, most: int) -> Iterator[bytes]:
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise FileError(path, f'{size:,} bytes; expected at most {most:,}')
+            raise FileError(path, f'{size:,} bytes; expected a text file of at most {most:,}')
         unpack = _UNPACK.get(path.suffix.lower())
         if not unpack:
             while block := file.read(_BLOCK):
