@@ -91,7 +91,7 @@ def read_text(path: Path) -> bytes:
     blocks = list[bytes]()
     begun = 0
     number = 1
-    for block in _blocks(path, _LARGEST):
+    for block in _blocks(path, _LARGEST, 'a text file of '):
         ends = np.flatnonzero(np.frombuffer(block, np.uint8) == _NEWLINE)
         lengths = np.diff(ends, prepend=-1, append=len(block)) - 1
         lengths[0] += begun  # a line may begin in one block and end in another
@@ -105,12 +105,12 @@ def read_text(path: Path) -> bytes:
     return b''.join(blocks)
 
 
-def _blocks(path: Path, most: int) -> Iterator[bytes]:
-    """Yield the content of a file in blocks; see `read_bytes`."""
+def _blocks(path: Path, most: int, expected: str = '') -> Iterator[bytes]:
+    """Yield the content of a file in blocks; expected : its kind, for the error on its size."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise FileError(path, f'{size:,} bytes; expected a text file of at most {most:,}')
+            raise FileError(path, f'{size:,} bytes; expected {expected}at most {most:,}')
         unpack = _UNPACK.get(path.suffix.lower())
         if not unpack:
             while block := file.read(_BLOCK):
