@@ -75,7 +75,8 @@ def batch(arguments: argparse.Namespace) -> Ending:
 
 def _words(arguments: argparse.Namespace) -> list[str]:
     """Return the options of `solve` that say how to read a recording."""
-    return ['--rotation-information', arguments.rotation_information,
+    stated = ['--information', repr(arguments.information)] if arguments.information else []
+    return [*stated, '--rotation-information', arguments.rotation_information,
             '--odom-topic', arguments.odom_topic, '--loop-topic', arguments.loop_topic]
 
 

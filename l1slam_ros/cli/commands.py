@@ -87,7 +87,7 @@ def read(arguments: argparse.Namespace, path: Path, quiet: bool = False) -> Grap
         return record
     topics = Topics(arguments.odom_topic, arguments.loop_topic, with_loops=False)
     record = formats.read_input(path, options, topics, arguments.rotation_information,
-                                options.dimension if options else 2)
+                                options.dimension if options else 2, arguments.information)
     warn(record.skipped, quiet)
     return record
 

@@ -10,6 +10,7 @@
 # PYTHON_ARGCOMPLETE_OK
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -30,8 +31,9 @@ READ_IN_PART = 3
 DOUBTFUL = 4
 INTERRUPTED = 130
 BROKEN_PIPE = 141
-_INPUT = ('a graph (.g2o, TORO .graph, .jrl, .cbor), a bag (rosbag2 directory, .mcap, .db3, .bag '
-          'of ROS 1) or a CARMEN log with laser scans (.clf, .log, also packed: .bz2, .gz)')
+_INPUT = ('a graph (.g2o, TORO .graph or .toro, .jrl, .cbor), a bag (rosbag2 directory, .mcap, '
+          '.db3, .bag of ROS 1) or a CARMEN log with laser scans (.clf, .log); graphs and logs '
+          'also packed: .bz2, .gz')
 _WORD = ('files beside a graph may vouch for loops (INPUT.trusted.txt) and strike loops out '
          '(INPUT.struck.txt), by lines `i j` of vertex ids')
 _OUTPUT = '.g2o, .jrl, .cbor, .tum, or a name without a suffix for a bag directory'
@@ -134,11 +136,14 @@ def _add_force(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_reading(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group('options for 3D g2o files and for bags').add_argument
+    add = parser.add_argument_group('options for graph files and for bags').add_argument
     add('--rotation-information', choices=names.ROTATION_INFORMATION,
         default=names.ROTATION_INFORMATION[0],
         help='3D g2o files, read and written: the rotation block of the information is that of '
         "the quaternion's vector part, as in g2o, or that of the angle (default: %(default)s)")
+    add('--information', type=_information, metavar='X',
+        help='graph files: the information, X on its diagonal, of factors that state none; '
+        'without it such a file is refused')
     for name, default, what in (
         ('odom', DEFAULT_TOPICS.odometry, 'a topic of nav_msgs/Odometry; or a topic with the pose '
          'graph of another front end, which is then taken whole: rtabmap_msgs/MapGraph, '
@@ -153,6 +158,17 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
         help="the node's parameter file: its keyframe, noise and solver parameters are used here, "
         'too. A bag written by l1slam says itself what its messages are; that replaces defaults, '
         'not what the file sets')
+
+
+def _information(text: str) -> float:
+    """Return the number above 0 that a text is."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text!r}; expected a number above 0')
+    return value
 
 
 def _add_solve(parser: argparse.ArgumentParser) -> None:

@@ -37,7 +37,8 @@ def merge(arguments: argparse.Namespace) -> Ending:
     formats.check_output(arguments.output, inputs(
         arguments, arguments.reference, arguments.loops), arguments.force)
     parts, found = _parts(arguments, paths)
-    whole = merged(parts, arguments.loops, found, arguments.rotation_information)
+    whole = merged(parts, arguments.loops, found, arguments.rotation_information,
+                   arguments.information)
 
     def settled(outcome: Outcome) -> tuple[Outcome, list[str]]:
         return _settled(outcome, whole, paths)
@@ -58,8 +59,9 @@ def _parts(arguments: argparse.Namespace, paths: list[Path]) -> tuple[list[Part]
 
 
 def _part(arguments: argparse.Namespace, path: Path) -> Part:
-    if path.is_file() and formats.GRAPH_READERS.get(path.suffix.lower()) is read_graph_file:
-        return Part(path, *read_one_of_several(path, arguments.rotation_information))
+    if path.is_file() and formats.graph_reader(path) is read_graph_file:
+        return Part(path, *read_one_of_several(
+            path, arguments.rotation_information, arguments.information))
     return Part(path, read(arguments, path, quiet=True))
 
 

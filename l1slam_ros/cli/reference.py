@@ -17,7 +17,7 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, align, poses_at
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.io.files import NANOSECONDS, counted
+from l1slam_ros.io.files import NANOSECONDS, counted, stamp_text
 from l1slam_ros.io.formats import is_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import beside, named_loops
@@ -89,12 +89,22 @@ def read_truth(source: str, record: GraphRecord, input_path: Path,
         stampless = reference.stamped and record.stamps is None
         hint = '; the graph has no stamps, so its poses are 0.1 s apart from 1000 s on'
         raise FileError(source, f'shares {counted(len(rows), "pose")} with the graph, expected '
-                        f'2 or more{hint if stampless else ""}')
+                        f'2 or more; it has {_interval(reference.keys, reference.stamped)}, the '
+                        f'graph {_interval(keys, reference.stamped)}{hint if stampless else ""}')
     scored = keys[rows]
     first, last = np.searchsorted(reference.keys, [scored.min(), scored.max()])
     inside = gaps[(gaps > first) & (gaps <= last)] - first
     path = np.insert(reference.poses[first:last + 1], inside, np.nan, axis=0)
     return Truth(rows, poses, path, reference.skipped, steps)
+
+
+def _interval(keys: Indices, stamped: bool) -> str:
+    """Return the first and the last of some stamps or ids in words."""
+    if not len(keys):
+        return 'no poses'
+    first, last = int(keys.min()), int(keys.max())
+    return (f'times from {stamp_text(first)} to {stamp_text(last)} s' if stamped
+            else f'ids from {first} to {last}')
 
 
 def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES
+from l1slam_ros.io.bounded import open_regular
 from l1slam_ros.io.formats import GRAPH_READERS, LOG_SUFFIXES, files_of
 
 _SUFFIXES = (*GRAPH_READERS, *BAG_SUFFIXES, *LOG_SUFFIXES)
@@ -120,7 +121,7 @@ def _is_bag(folder: Path, names: Iterable[str]) -> bool:
     if any(name.lower().endswith(BAG_SUFFIXES) for name in names):
         return True
     try:
-        with open(folder / _METADATA, 'rb') as file:
+        with open_regular(folder / _METADATA) as file:
             return _WORD in file.read(_ENOUGH)
-    except OSError:
+    except (OSError, FileError):
         return False

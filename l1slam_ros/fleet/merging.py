@@ -71,7 +71,7 @@ class Merged:
 
 
 def merged(parts: Sequence[Part], loops: Path | None, found: Found | None = None,
-           rotation_information: str = QUATERNION) -> Merged:
+           rotation_information: str = QUATERNION, information: float | None = None) -> Merged:
     """
     Return one graph of all parts.
 
@@ -82,6 +82,7 @@ def merged(parts: Sequence[Part], loops: Path | None, found: Found | None = None
         from 1, and the vertex in it
     found : loops that a front end found
     rotation_information : of that file, see `GraphRecord`
+    information : of its edges without one, see `read_input`
 
     Raises
     ------
@@ -99,8 +100,7 @@ def merged(parts: Sequence[Part], loops: Path | None, found: Found | None = None
     order = np.argsort(ids)
     index = np.argsort(order)
     of_input = np.repeat(np.arange(len(parts)), [len(part) for part in new])
-    starts = np.cumsum([0, *(len(part) for part in new)])
-    own = [index[starts[k]:starts[k + 1]] for k in range(len(parts))]
+    own = np.split(index, np.cumsum([len(part) for part in new])[:-1])
     graph = _keyframes(parts, ids[order], of_input[order], own)
     for part, place in zip(parts, own, strict=True):
         factors = part.record.graph.between
@@ -119,7 +119,8 @@ def merged(parts: Sequence[Part], loops: Path | None, found: Found | None = None
         graph.append_between(i, j, found.measurement, found.roots)
         said += found.said
     if loops is not None:
-        said += _append(graph, loops, *_listed(parts, own, loops, rotation_information))
+        said += _append(graph, loops, *_listed(
+            parts, own, loops, rotation_information, information))
     stamps = [part.record.stamps for part in parts]
     known = [stamp for stamp in stamps if stamp is not None]
     return Merged(GraphRecord(
@@ -202,7 +203,7 @@ def _append(graph: FactorGraph, path: Path, edges: Rows, ends: Indices) -> list[
 
 
 def _listed(parts: Sequence[Part], own: list[Indices], path: Path,
-            rotation_information: str) -> tuple[Rows, Indices]:
+            rotation_information: str, information: float | None) -> tuple[Rows, Indices]:
     """Return the edges of a file of loops, and their keyframes (m, 2)."""
     manifold = parts[0].record.graph.manifold
     tags = [name for name, tag in TAGS.items() if (tag.kind, tag.manifold) == (
@@ -221,7 +222,7 @@ def _listed(parts: Sequence[Part], own: list[Indices], path: Path,
         groups[tag].texts.append(f'0 1 {names[2]}')
     if not ends:
         raise FileError(path, f'no loops; expected lines `{tags[0]} NUMBER:ID NUMBER:ID ...`')
-    rows = rows_of(path, groups, manifold, ('between',), rotation_information)
+    rows = rows_of(path, groups, manifold, ('between',), rotation_information, information)
     found = np.array([ends[number] for number in rows.lines.tolist()])
     if (found[:, 0] == found[:, 1]).any():
         k = int(np.argmax(found[:, 0] == found[:, 1]))

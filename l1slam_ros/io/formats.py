@@ -12,6 +12,7 @@ Reading a graph from any input file, and writing one to any output file.
 `l1slam_ros.read_graph` and `write_graph` are at the end.
 """
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -37,10 +38,12 @@ from l1slam_ros.core.graph.measurements import as_poses
 from l1slam_ros.core.graph.parts import initial_poses
 from l1slam_ros.core.names import QUATERNION, ROTATION_INFORMATION
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
+from l1slam_ros.io.bounded import unpacked_name
 from l1slam_ros.io.files import require_file, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.graphs.left_out import left_out_of, nothing_left_out
 from l1slam_ros.io.graphs.robot_log import RobotLog
+from l1slam_ros.io.graphs.rows import begins_as_graph
 from l1slam_ros.io.graphs.side_files import BESIDE, WRITTEN_BESIDE, beside
 from l1slam_ros.io.jrl.document import cbor_library, is_cbor
 from l1slam_ros.io.jrl.layout import JRL_SUFFIXES
@@ -52,19 +55,20 @@ if TYPE_CHECKING:
     from l1slam_ros.core.scans.points import Scan
 
 
-def _read_jrl_file(path: Path, rotation_information: str) -> GraphRecord:
+def _read_jrl_file(path: Path, rotation_information: str, _: float | None) -> GraphRecord:
     from l1slam_ros.io.jrl.reading import read_jrl_file
 
     return read_jrl_file(path, rotation_information)
 
 
-# Suffix -> reader. A reader takes the path and `rotation_information`, see `GraphRecord`, and
-# raises FileError.
-GRAPH_READERS: dict[str, Callable[[Path, str], GraphRecord]] = {
+# Suffix -> reader. A reader takes the path, `rotation_information`, see `GraphRecord`, and the
+# information of factors without one, and raises FileError.
+GRAPH_READERS: dict[str, Callable[[Path, str, float | None], GraphRecord]] = {
     '.g2o': read_graph_file,
     '.jrl': _read_jrl_file,
     '.cbor': _read_jrl_file,
     '.graph': read_graph_file,
+    '.toro': read_graph_file,
 }
 
 
@@ -89,18 +93,21 @@ _ORIGINS: WeakKeyDictionary[FactorGraph, _Origin] = WeakKeyDictionary()
 
 def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
                topics: Topics = DEFAULT_TOPICS, rotation_information: str = QUATERNION,
-               dimension: int = 2) -> GraphRecord:
+               dimension: int = 2, information: float | None = None) -> GraphRecord:
     """
     Read a graph file or grow a graph from a bag.
 
     Parameters
     ----------
-    path : .g2o, .graph, .jrl, .cbor, .mcap, .db3, .bag (ROS 1) or a rosbag2 directory
+    path : .g2o, .graph, .toro, .jrl, .cbor, each also packed (.gz, .bz2), .txt with such content,
+        .mcap, .db3, .bag (ROS 1) or a rosbag2 directory
     options : how messages of a bag become keyframes; None: the node's defaults. A note in the bag
         replaces defaults
     topics : the topics of a bag
     rotation_information : see `GraphRecord`; the record keeps it for writing
     dimension : of the poses of a bag (2 or 3), unless the bag notes it
+    information : the entries on the diagonal of the information of factors of a graph file that
+        state none; None: such a file is refused
 
     Raises
     ------
@@ -115,13 +122,27 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
 
         record = graph_from_bag(path, options, topics, dimension)
         return replace(record, rotation_information=rotation_information)
-    # `map.g2o.1` is the previous map of the node.
-    name = path.name.lower().removesuffix('.1')
-    for suffix, read in GRAPH_READERS.items():
-        if name.endswith(suffix):
-            return read(path, rotation_information)
+    read = graph_reader(path)
+    if read is not None:
+        return read(path, rotation_information, information)
     raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_READERS)}, '
                     f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')
+
+
+def graph_reader(path: Path) -> Callable[[Path, str, float | None], GraphRecord] | None:
+    """
+    Return what reads a graph file, by its name; None: it is none.
+
+    Raises
+    ------
+    FileError : it is a text file that cannot be read.
+
+    """
+    # `map.g2o.1` is the previous map of the node.
+    suffix = Path(unpacked_name(path).removesuffix('.1')).suffix
+    # Some programs give their graphs the name of any text.
+    is_text = path.suffix.lower() == '.txt' and begins_as_graph(path)
+    return read_graph_file if is_text else GRAPH_READERS.get(suffix)
 
 
 def is_bag(path: Path) -> bool:
@@ -131,7 +152,8 @@ def is_bag(path: Path) -> bool:
 
 def is_log(path: Path) -> bool:
     """Tell whether an input is read as a log of scans, see `io.scans`."""
-    return path.is_file() and path.suffix.lower() in LOG_SUFFIXES
+    return (path.is_file() and path.suffix.lower() in LOG_SUFFIXES
+            and Path(unpacked_name(path)).suffix not in GRAPH_READERS)
 
 
 def stored_poses(record: GraphRecord) -> Array:
@@ -239,7 +261,7 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None,
 
 def read_graph(path: str | os.PathLike[str], *, odom_topic: str = DEFAULT_TOPICS.odometry,
                loop_topic: str = DEFAULT_TOPICS.loops, rotation_information: str = QUATERNION,
-               ) -> tuple[FactorGraph, Array | None]:
+               information: float | None = None) -> tuple[FactorGraph, Array | None]:
     """
     Return the graph in a file, and the poses (n, p) stored with it, or None.
 
@@ -249,11 +271,14 @@ def read_graph(path: str | os.PathLike[str], *, odom_topic: str = DEFAULT_TOPICS
 
     Parameters
     ----------
-    path : .g2o, TORO .graph, .jrl, .cbor, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1
+    path : .g2o, TORO .graph or .toro, .jrl, .cbor, each also packed (.gz, .bz2), a rosbag2
+        directory, .mcap, .db3, or .bag of ROS 1
     odom_topic, loop_topic : of a bag: the topics of the odometry and of the loops, or of the pose
         graph of a front end, see `l1slam solve --help`
     rotation_information : the rotation block of the information in a 3D g2o file is that of the
         quaternion's vector part, `quaternion`, as in g2o, or that of the angle, `angle`
+    information : the entries on the diagonal of the information of factors of a graph file that
+        state none; None: such a file is refused
 
     Raises
     ------
@@ -262,10 +287,14 @@ def read_graph(path: str | os.PathLike[str], *, odom_topic: str = DEFAULT_TOPICS
 
     """
     _check_reading(path, rotation_information)
+    if information is not None:
+        require((int, float), 'information', information, 'a number')
+        if not 0 < information < math.inf:
+            raise OptionError(f'information is {information:g}, expected a number above 0')
     for name, topic in (('odom_topic', odom_topic), ('loop_topic', loop_topic)):
         require(str, name, topic, 'the name of a topic')
     record = read_input(Path(path), topics=Topics(odom_topic, loop_topic),
-                        rotation_information=rotation_information)
+                        rotation_information=rotation_information, information=information)
     for sentence in filter(None, (*record.skipped, record.damage)):
         warnings.warn(sentence, stacklevel=2)
     _ORIGINS[record.graph] = _Origin(record.ids, record.stamps, record.left_out, record.comments,

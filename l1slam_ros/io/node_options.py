@@ -20,7 +20,7 @@ from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.names import OF_ROS
 from l1slam_ros.core.options import Options, Scalar, dotted, option
 from l1slam_ros.core.running.backend import BackendOptions
-from l1slam_ros.io.bounded import read_yaml
+from l1slam_ros.io.bounded import read_text, read_yaml
 from l1slam_ros.io.files import reported
 
 # A robot's name, which topics begin with.
@@ -104,7 +104,7 @@ def read_params_file(path: Path) -> NodeOptions:
 
     """
     with reported(path, 'read'):
-        written = path.read_bytes()
+        written = read_text(path)
     try:
         content = read_yaml(written.decode())
     except (ValueError, yaml.YAMLError) as error:

@@ -14,7 +14,7 @@ TUM: `stamp x y z qx qy qz qw`, stamps in seconds, exact to the nanosecond.
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ import numpy as np
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.io.bounded import unpacked_name
 from l1slam_ros.io.files import (
     TextLines,
     counted,
@@ -37,6 +38,7 @@ from l1slam_ros.io.jrl.layout import JRL_SUFFIXES
 from l1slam_ros.io.ours import marked
 
 _TUM_COLUMNS = 8
+_NAN = {'nan', '-nan'}
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,8 @@ def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
     Read reference poses: TUM, vertices of a graph, `id x y theta`, or CSV `stamp, x, y, theta`.
 
     From a JRL file, its groundtruth is read. The first line of other files shows their format:
-    with commas it is a CSV file, whose first column is a stamp, and which may have a header line.
+    with commas it is a CSV file, whose first column is a stamp. A line of names may be above the
+    numbers. Poses with a NaN are left out.
 
     by_stamps : use the stamps beside a graph file, if there are any, instead of its ids
 
@@ -90,7 +93,7 @@ def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
     FileError : naming the line, if the file has none of these formats.
 
     """
-    if Path(path).suffix.lower() in JRL_SUFFIXES:
+    if Path(unpacked_name(path)).suffix in JRL_SUFFIXES:
         from l1slam_ros.io.jrl.reading import read_truth
 
         return Reference(*read_truth(Path(path), manifold), stamped=False)
@@ -98,14 +101,15 @@ def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
     if not lines.texts:
         raise FileError(path, 'the file is empty; expected reference poses')
     number = lines.numbers[0]
-    first = lines.texts[0].strip()
-    is_csv = ',' in first
-    in_words = first[0].isalpha()
-    if is_csv:
-        lines = TextLines(lines.numbers[in_words:],
-                          [text.replace(',', ' ') for text in lines.texts[in_words:]])
-    elif in_words:
+    is_csv = ',' in lines.texts[0]
+    in_words = not _is_number(lines.texts[0])
+    if in_words and not is_csv and not (len(lines.texts) > 1 and _is_number(lines.texts[1])):
         return _read_vertices(path, manifold, by_stamps)
+    lines, skipped = _of_numbers(TextLines(
+        lines.numbers[in_words:], [text.replace(',', ' ') if is_csv else text
+                                   for text in lines.texts[in_words:]]))
+    if skipped and not lines.texts:
+        raise FileError(path, f'{skipped[0]}; expected reference poses')
     fields = lines.texts[0].split() if lines.texts else []
     is_tum = len(fields) == _TUM_COLUMNS
     size = 1 + manifold.POSE_SIZE
@@ -121,7 +125,27 @@ def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
     if is_tum:
         refuse_quaternions(path, poses[:, 3:], lines.numbers)
         poses = manifold.from_pose3(poses)
-    return _sorted(path, lines, keys[:, 0], poses, stamped=stamped)
+    return _sorted(path, lines, Reference(keys[:, 0], poses, stamped, skipped))
+
+
+def _is_number(line: str) -> bool:
+    """Tell whether the first field of a line is a number."""
+    try:
+        float(line.replace(',', ' ').split()[0])
+    except (ValueError, IndexError):
+        return False
+    return True
+
+
+def _of_numbers(lines: TextLines) -> tuple[TextLines, tuple[str, ...]]:
+    """Return the lines without those that have a NaN, and a sentence that counts these."""
+    sound = [k for k, text in enumerate(lines.texts)
+             if _NAN.isdisjoint(text.lower().split())]
+    lost = len(lines.texts) - len(sound)
+    if not lost:
+        return lines, ()
+    return (TextLines([lines.numbers[k] for k in sound], [lines.texts[k] for k in sound]),
+            (f'{counted(lost, "true pose")} of {len(lines.texts):,} left out: NaN',))
 
 
 def _read_vertices(path: str | os.PathLike[str], manifold: Manifold, by_stamps: bool) -> Reference:
@@ -144,12 +168,11 @@ def _whole_stamps(path: object, lines: TextLines) -> TextLines:
     return TextLines(lines.numbers, texts)
 
 
-def _sorted(path: object, lines: TextLines, keys: Indices, poses: Array, *,
-            stamped: bool) -> Reference:
+def _sorted(path: object, lines: TextLines, found: Reference) -> Reference:
     """Return the reference in ascending order of its keys; each may stand once."""
-    order = np.argsort(keys, kind='stable')
-    again = np.flatnonzero(np.diff(keys[order]) == 0) + 1
+    order = np.argsort(found.keys, kind='stable')
+    again = np.flatnonzero(np.diff(found.keys[order]) == 0) + 1
     if len(again):
         line = min(lines.numbers[k] for k in order[again])
         raise FileError(path, 'the same id or stamp a second time; expected each once', line)
-    return Reference(keys[order], poses[order], stamped)
+    return replace(found, keys=found.keys[order], poses=found.poses[order])

@@ -521,7 +521,7 @@ def test_info_of_a_good_graph_and_of_its_bag(capsys, world, tmp_path):
 
 def test_info_says_what_was_skipped(capsys, tmp_path):
     out, err = run(capsys, 'info', graph_file(tmp_path, [*VERTICES, *EDGES, 'VERTEX_XY 9 1 2']))
-    assert "- 1 'VERTEX_XY' line is not used" in out and err == ''
+    assert "- 1 line not used: 1 'VERTEX_XY' (landmarks" in out and err == ''
 
 
 def words(path):

@@ -42,6 +42,7 @@ from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, is_cut, opened, 
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES
 from l1slam_ros.io.bags.writer import NOTE_KEY
 from l1slam_ros.io.bounded import read_yaml
+from l1slam_ros.io.files import other_kind
 
 # Types that ROS 1 messages contain, in their ROS 2 form.
 _BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
@@ -209,6 +210,9 @@ def _bag_path(path: str | os.PathLike[str]) -> Path:
     if bag.is_dir() and not (bag / METADATA).is_file() and len(bag_names(bag)) != 1:
         raise FileError(path, f'a directory without {METADATA} and with the files of '
                         f'{len(bag_names(bag))} bags; expected a rosbag2 directory')
+    for part in bag.iterdir() if bag.is_dir() else (bag, bag.with_name(f'{bag.name}-wal')):
+        if kind := '' if part.is_dir() else other_kind(part):  # reading it may never end
+            raise FileError(part, f'cannot be read: it is {kind}')
     return bag
 
 

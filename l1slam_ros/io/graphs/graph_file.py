@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Reading pose graphs in g2o (`.g2o`) and TORO (`.graph`) format, and writing g2o; see `tags`.
+Reading pose graphs in g2o and TORO (`.graph`, `.toro`) format, and writing g2o; see `tags`.
 
 Neither format has a place for stamps and for loops that a person vouched for or struck out: see
 `side_files`, and for saved maps `remarks`.
@@ -30,7 +30,6 @@ from l1slam_ros.core.robust.odometry.drift import correction, straightened
 from l1slam_ros.io.files import (
     LARGEST,
     TextLines,
-    counted,
     first_failure,
     formatted,
     invented_stamps,
@@ -46,16 +45,20 @@ from l1slam_ros.io.graphs.robots import keyframes_of
 from l1slam_ros.io.graphs.rows import (
     Rows,
     expected_tags,
+    in_order_of_file,
     lines_by_tag,
     made_definite,
     manifold_of,
+    not_used,
+    refuse_unknown_ties,
     rows_of,
     turning_too_far,
     vertices_of,
+    with_equivalents,
     without_circles,
 )
-from l1slam_ros.io.graphs.side_files import named_loops, read_stamps, write_beside
-from l1slam_ros.io.graphs.tags import FACTORS, NO_OFFSET, OFFSET, SENSORS, TAGS, TAGS_LEFT_OUT
+from l1slam_ros.io.graphs.side_files import loops_between, named_loops, read_stamps, write_beside
+from l1slam_ros.io.graphs.tags import FACTORS, NO_OFFSET, TAGS
 from l1slam_ros.io.ours import MARK
 from l1slam_ros.io.remarks import Remarks
 
@@ -102,27 +105,29 @@ class GraphRecord:
         return straightened(self.graph, self.drift).subset(left_out_words(self) == '')
 
 
-def read_graph_file(path: str | os.PathLike[str],
-                    rotation_information: str = QUATERNION) -> GraphRecord:
+def read_graph_file(path: str | os.PathLike[str], rotation_information: str = QUATERNION,
+                    information: float | None = None) -> GraphRecord:
     """
     Read a g2o or TORO file, with the stamps and the vouched-for and struck-out loops beside it.
 
     Vertices may be in any order. Without vertex lines, the vertices are those of the edges, and
     `poses` is None. The graph need not be connected.
 
+    information : the entries on the diagonal of the information of factors without one
+
     Raises
     ------
     FileError : naming the line, if the file is malformed, or a file beside it does not match it.
 
     """
-    record, beyond = read_one_of_several(path, rotation_information)
+    record, beyond = read_one_of_several(path, rotation_information, information)
     if len(beyond):
         _index(path, record.ids, beyond)
     return record
 
 
-def read_one_of_several(path: str | os.PathLike[str],
-                        rotation_information: str = QUATERNION) -> tuple[GraphRecord, Rows]:
+def read_one_of_several(path: str | os.PathLike[str], rotation_information: str = QUATERNION,
+                        information: float | None = None) -> tuple[GraphRecord, Rows]:
     """
     Read a graph as `read_graph_file` does, and its edges to vertices of other files.
 
@@ -135,13 +140,16 @@ def read_one_of_several(path: str | os.PathLike[str],
     groups, remarks = lines.groups, lines.remarks
     manifold = manifold_of(path, groups)
     edges, circles = without_circles(
-        rows_of(path, groups, manifold, FACTORS, rotation_information))
+        rows_of(path, groups, manifold, FACTORS, rotation_information, information))
+    edges, reordered = in_order_of_file(edges, groups)
     edges, indefinite = made_definite(edges)
-    said = *circles, *indefinite, *turning_too_far(edges, manifold)
     if edges.alone.all():
         raise FileError(path, f'no edges; expected {expected_tags("between")} lines')
+    edges, vouched, equivalents = with_equivalents(path, groups, edges)
+    said = *circles, *reordered, *indefinite, *turning_too_far(edges, manifold), *equivalents
     vertices = vertices_of(path, groups, manifold)
     ids = vertices.ids[:, 0] if len(vertices) else np.unique(edges.ids)
+    refuse_unknown_ties(path, groups, ids)
     anchors = anchors_of(groups, ids, edges)
     if len(anchors):
         kept = ~np.isin(ids, anchors)
@@ -152,7 +160,7 @@ def read_one_of_several(path: str | os.PathLike[str],
     edges, beyond = edges.chosen(inside), edges.chosen(~inside)
     order, left_out, as_measured = in_place(edges.lines, lines.left_out)
     stand, corrected, edges = edges.lines[order], edges.pose[order], edges.chosen(as_measured)
-    _add_edges(path, graph, ids, edges, remarks, left_out == STRUCK)
+    _add_edges(path, graph, ids, edges, remarks, left_out == STRUCK, vouched)
     changed = np.flatnonzero(order != as_measured)
     used = np.flatnonzero(left_out == '')
     ends = np.concatenate(([0], used + 1))
@@ -216,7 +224,7 @@ def _stamps(path: str | os.PathLike[str], ids: Indices, remarks: Remarks) -> Ind
 
 
 def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, edges: Rows,
-               remarks: Remarks, struck_here: Mask) -> None:
+               remarks: Remarks, struck_here: Mask, vouched: Indices) -> None:
     i, j = _index(path, ids, edges).T
     i, none = np.where(edges.alone, WORLD, i), np.zeros(len(edges), bool)
     if not remarks:  # all poses of a saved map are of robots
@@ -225,7 +233,8 @@ def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, e
     doubted = BetweenFactors(i, j, edges.pose, roots, none, none, graph.predecessor)
     trusted, struck = (remarks['trusted'], remarks['struck']) if remarks else (
         named_loops(path, name, ids, doubted) for name in ('trusted', 'struck'))
-    graph.append_between(i, j, edges.pose, roots, trusted & ~struck & ~struck_here,
+    true = trusted | loops_between(ids, doubted, vouched)
+    graph.append_between(i, j, edges.pose, roots, true & ~struck & ~struck_here,
                          (struck & ~trusted) | struck_here)
 
 
@@ -269,12 +278,7 @@ def _skipped(groups: dict[str, TextLines], ids: Indices,
     if set(fixed) - {str(ids[0])}:
         sentences.append(f'FIX {quoted(" ".join(fixed))} is not used: the first vertex, {ids[0]}, '
                          'is the one held fixed')
-    for tag, group in groups.items():
-        if tag not in TAGS and tag not in ('FIX', OFFSET):
-            lines = counted(len(group.texts), f'{quoted(tag)} line is', f'{quoted(tag)} lines are')
-            sentences.append(f'{lines} not used: '
-                             f'{TAGS_LEFT_OUT.get(tag, SENSORS)}')
-    return tuple(sentences)
+    return *sentences, *not_used(groups)
 
 
 def graph_lines(path: Path, record: GraphRecord) -> list[str]:

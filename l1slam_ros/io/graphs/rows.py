@@ -10,29 +10,54 @@
 
 import math
 import os
+import re
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import LEAST_EIGENVALUE, Mask, distinct, nearest_definite
+from l1slam_ros.core.geometry.noise import (
+    LEAST_EIGENVALUE,
+    LEAST_VARIANCE,
+    Mask,
+    distinct,
+    nearest_definite,
+)
 from l1slam_ros.core.names import QUATERNION
+from l1slam_ros.io.bounded import open_regular
 from l1slam_ros.io.files import (
     TextLines,
     counted,
     quoted,
     read_lines,
+    reported,
 )
 from l1slam_ros.io.graphs.left_out import restored
 from l1slam_ros.io.graphs.parsing import parse_rows, refuse_quaternions
-from l1slam_ros.io.graphs.tags import OFFSET, TAGS, TAGS_LEFT_OUT
+from l1slam_ros.io.graphs.tags import (
+    EQUIVALENT,
+    OFFSET,
+    OTHER_ORDER,
+    SENSORS,
+    TAGS,
+    TAGS_LEFT_OUT,
+    UNKNOWN,
+    Tag,
+)
 from l1slam_ros.io.remarks import Remarks
 
 # Number of lines that one sentence names.
 _NAMED = 3
 _MATRICES = 'information matrices'
+# A tag of another program, and how many of them one sentence names.
+_TAG = re.compile('[A-Za-z][A-Za-z0-9_:]*')
+_TAGS_NAMED = 10
+_BEGIN = 2**16  # [bytes]
+# The begin of a line that may tie two vertices, as edges do.
+_TWO_IDS = re.compile(r'(-?[0-9]{1,18})\s+(-?[0-9]{1,18})(?=\s|$)')
 
 
 @dataclass(frozen=True)
@@ -73,15 +98,30 @@ class GraphLines:
     """
     The lines of a graph file.
 
-    groups : tag -> its lines, without the tag; all tags are known; left_out : line number -> why
-    the map does not use the factor on this line, and the factor's place; remarks : the state of a
-    saved map; comments : numbers and texts.
+    groups : tag -> its lines, without the tag; no unknown tag is of an edge; left_out : line
+    number -> why the map does not use the factor on this line, and the factor's place; remarks :
+    the state of a saved map; comments : numbers and texts.
     """
 
     groups: dict[str, TextLines]
     left_out: dict[int, tuple[str, int]]
     remarks: Remarks
     comments: tuple[tuple[int, str], ...]
+
+
+def begins_as_graph(path: Path) -> bool:
+    """
+    Tell whether one of the first lines of a file has a tag.
+
+    Raises
+    ------
+    FileError : it cannot be read, or is no regular file.
+
+    """
+    with reported(path, 'read'), open_regular(path) as file:
+        begin = file.read(_BEGIN)
+    return any(line.split(None, 1)[:1] == [tag.encode()]
+               for line in begin.splitlines() for tag in TAGS)
 
 
 def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
@@ -102,13 +142,54 @@ def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
         begin = end
     if not groups:
         raise FileError(path, f'the file is empty; expected {expected_tags("between")} lines')
-    known = TAGS.keys() | TAGS_LEFT_OUT.keys() | {'FIX'}
+    is_graph = bool(groups.keys() & TAGS.keys())
     for tag, group in groups.items():
-        if tag not in known and not tag.startswith('PARAMS_'):
-            usual = [name for name in TAGS if TAGS[name].kind in ('vertex', 'between')]
-            raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(usual)}',
-                            group.numbers[0])
+        if not (_is_known(tag) or (is_graph and _may_be_left_out(tag))):
+            raise _unknown(path, tag, group.numbers[0])
     return GraphLines(groups, left_out, lines.remarks, lines.comments)
+
+
+def _unknown(path: object, tag: str, line: int) -> FileError:
+    usual = [name for name in TAGS if TAGS[name].kind in ('vertex', 'between')]
+    return FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(usual)}', line)
+
+
+def _is_known(tag: str) -> bool:
+    return (tag in TAGS or tag in TAGS_LEFT_OUT or tag in ('FIX', EQUIVALENT)
+            or tag.startswith('PARAMS_'))
+
+
+def _may_be_left_out(tag: str) -> bool:
+    """Tell whether an unknown tag ties no poses: it is no edge, and no misspelt known tag."""
+    return bool(_TAG.fullmatch(tag)) and 'EDGE' not in tag.upper() and not _is_known(tag.upper())
+
+
+def refuse_unknown_ties(path: object, groups: dict[str, TextLines], ids: Indices) -> None:
+    """Raise for a line of an unknown tag that begins with two of the vertices `ids`, (n,)."""
+    for tag, group in groups.items():
+        if _is_known(tag) or tag.startswith('VERTEX'):
+            continue
+        ends = [(number, found) for number, text in zip(group.numbers, group.texts, strict=True)
+                if (found := _TWO_IDS.match(text))]
+        both = np.array([found.groups() for _, found in ends], np.int64).reshape(-1, 2)
+        tied = np.isin(both, ids).all(axis=1) & (both[:, 0] != both[:, 1])
+        if tied.any():
+            raise _unknown(path, tag, ends[int(np.argmax(tied))][0])
+
+
+def not_used(groups: dict[str, TextLines]) -> list[str]:
+    """Return a sentence that counts the lines that are not used by their tags, if any."""
+    of_reason: dict[str, list[str]] = {}
+    count = 0
+    for tag, group in groups.items():
+        if tag in TAGS or tag in ('FIX', OFFSET, EQUIVALENT):
+            continue
+        count += len(group.texts)
+        reason = SENSORS if tag.startswith('PARAMS_') else TAGS_LEFT_OUT.get(tag, UNKNOWN)
+        of_reason.setdefault(reason, []).append(f'{len(group.texts):,} {quoted(tag)}')
+    parts = [f'{", ".join(tags[:_TAGS_NAMED])}{", ..." * (len(tags) > _TAGS_NAMED)} ({reason})'
+             for reason, tags in of_reason.items()]
+    return [f'{counted(count, "line")} not used: {"; ".join(parts)}'] if parts else []
 
 
 def _alike(texts: list[str], begin: int, start: str) -> int:
@@ -135,10 +216,20 @@ def manifold_of(path: object, groups: dict[str, TextLines]) -> Manifold:
 
 
 def rows_of(path: object, groups: dict[str, TextLines], manifold: Manifold, kinds: tuple[str, ...],
-          rotation_information: str = QUATERNION) -> Rows:
-    """Return the lines of some kinds (vertex, edge, ...), whichever tags they have."""
+          rotation_information: str = QUATERNION, information: float | None = None) -> Rows:
+    """
+    Return the lines of some kinds (vertex, edge, ...), whichever tags they have.
+
+    information : the entries on the diagonal of the information where a line has none
+
+    Raises
+    ------
+    FileError : naming the first malformed line.
+
+    """
     offsets = _offsets(path, groups)
-    parts = [_parse(path, name, groups.get(name, TextLines([], [])), rotation_information, offsets)
+    parts = [_parse(path, name, groups.get(name, TextLines([], [])), rotation_information, offsets,
+                    information)
              for name, tag in TAGS.items() if tag.kind in kinds and tag.manifold is manifold]
     filled = [part for part in parts if len(part)] or parts[:1]
     both = filled[0] if len(filled) == 1 else Rows(
@@ -148,11 +239,16 @@ def rows_of(path: object, groups: dict[str, TextLines], manifold: Manifold, kind
 
 
 def _parse(path: object, name: str, lines: TextLines, rotation_information: str,
-           offsets: Indices) -> Rows:
+           offsets: Indices, stated: float | None) -> Rows:
     tag = TAGS[name]
     p = tag.values
     d = tag.manifold.TANGENT_SIZE
-    ids, values = parse_rows(path, name, lines, tag.ids, p + len(tag.information))
+    size = p + len(tag.information)
+    try:
+        ids, values = parse_rows(path, name, lines, tag.ids, size)
+    except FileError:
+        lines = _with_information(path, name, tag, lines, stated)
+        ids, values = parse_rows(path, name, lines, tag.ids, size)
     m = len(ids)
     if tag.has_quaternion:
         refuse_quaternions(path, values[:, 3:p], lines.numbers)
@@ -171,6 +267,24 @@ def _parse(path: object, name: str, lines: TextLines, rotation_information: str,
                  np.repeat(ids[:, :tag.vertices], 2 // tag.vertices, axis=1),
                  np.full(m, tag.vertices == 1), pose, information,
                  np.broadcast_to(tag.units(rotation_information), (m, d)))
+
+
+def _with_information(path: object, name: str, tag: Tag, lines: TextLines,
+                      stated: float | None) -> TextLines:
+    """Return the lines with a multiple of the identity as information where they have none."""
+    short = tag.ids + tag.values
+    texts = [text.split('#', 1)[0] for text in lines.texts]
+    without = [k for k, text in enumerate(texts) if len(text.split()) == short]
+    if not without or not tag.information:
+        return lines
+    if stated is None:
+        raise FileError(path, f'{name}: {counted(short, "field")}, the information is missing; '
+                        f'expected {tag.ids} whole and {tag.values + len(tag.information)} finite '
+                        'numbers, or the option `--information X`', lines.numbers[without[0]])
+    end = ' '.join(repr(stated) if row == column else '0' for row, column in tag.information)
+    for k in without:
+        texts[k] = f'{texts[k]} {end}'
+    return replace(lines, texts=texts)
 
 
 def _offsets(path: object, groups: dict[str, TextLines]) -> Indices:
@@ -204,6 +318,38 @@ def without_circles(edges: Rows) -> tuple[Rows, list[str]]:
     return edges.chosen(~circle), [sentence]
 
 
+def with_equivalents(path: object, groups: dict[str, TextLines],
+                     edges: Rows) -> tuple[Rows, Indices, list[str]]:
+    """
+    Return the edges with one of the zero pose between equivalent vertices that have none.
+
+    And the ids (k, 2) of the equivalent vertices, and a sentence if there are any.
+    """
+    lines = groups.get(EQUIVALENT, TextLines([], []))
+    pairs = parse_rows(path, EQUIVALENT, lines, ids=2, values=0)[0]
+    if not len(pairs):
+        return edges, pairs, []
+    joined = {tuple(pair) for pair in np.sort(edges.ids, axis=1).tolist()}
+    alone = np.zeros(len(pairs), bool)
+    for k, pair in enumerate(map(tuple, np.sort(pairs, axis=1).tolist())):
+        alone[k] = pair not in joined and pair[0] != pair[1]
+        joined.add(pair)
+    count = int(alone.sum())
+    said = [f'{counted(len(pairs), f"{EQUIVALENT} line")}: the loops between these vertices are '
+            'vouched for']
+    if not count:
+        return edges, pairs, said
+    said[0] += f'; {counted(count, "pair")} without an edge tied to each other'
+    d = edges.units.shape[1]
+    pose = np.zeros((count, edges.pose.shape[1]))
+    pose[:, d:] = 1.0  # of a quaternion
+    ties = Rows(np.array(lines.numbers, np.int64)[alone], pairs[alone], np.zeros(count, bool),
+                pose, np.tile(np.eye(d) / LEAST_VARIANCE, (count, 1, 1)), np.ones((count, d)))
+    both = Rows(*(np.concatenate([getattr(edges, column.name), getattr(ties, column.name)])
+                  for column in fields(Rows)))
+    return both.chosen(np.argsort(both.lines, kind='stable')), pairs, said
+
+
 def turning_too_far(edges: Rows, manifold: Manifold) -> list[str]:
     """Return a sentence if edges in the plane turn by more than a full turn, as in degrees."""
     turns = abs(edges.pose[:, 2]) if manifold is se2 else np.zeros(len(edges))
@@ -214,6 +360,37 @@ def turning_too_far(edges: Rows, manifold: Manifold) -> list[str]:
     return [f'{count:,} of {counted(len(edges), "edge")} turn{"s" * (count == 1)} by more than '
             f'2 pi, the most by {turns[most]:.4g} at line {edges.lines[most]:,}: all angles are '
             'read as radians; are these degrees?']
+
+
+def in_order_of_file(edges: Rows, groups: dict[str, TextLines]) -> tuple[Rows, list[str]]:
+    """
+    Return the edges with their information in the order of the file, and a sentence if it differs.
+
+    Some programs write g2o's order under TORO's tags. The order is one of the whole file: the
+    other one is taken where most matrices are indefinite in that of the tags, and definite in it.
+    """
+    orders = {name: TAGS[name].information for name in groups
+              if name in TAGS and TAGS[name].information in OTHER_ORDER}
+    indefinite = _count_indefinite(edges) if orders else 0
+    if 2 * indefinite <= len(edges):
+        return edges, []
+    information = edges.information.copy()
+    for name, order in orders.items():
+        rows = np.flatnonzero(np.isin(edges.lines, groups[name].numbers))
+        for (row, column), (was_row, was_column) in zip(OTHER_ORDER[order], order, strict=True):
+            information[rows, row, column] = information[rows, column, row] = (
+                edges.information[rows, was_row, was_column])
+    other = replace(edges, information=information)
+    if 2 * _count_indefinite(other) > len(edges):
+        return edges, []
+    whose = 'g2o' if 'EDGE2' in orders else 'TORO'
+    return other, [f'{indefinite:,} of {counted(len(edges), "information matrix", _MATRICES)} not '
+                   f'positive definite in the order of the tags: all are read in that of {whose}']
+
+
+def _count_indefinite(edges: Rows) -> int:
+    place, which = distinct(edges.scaled)
+    return int(np.isfinite(nearest_definite(edges.scaled[place])[1])[which].sum())
 
 
 def made_definite(edges: Rows) -> tuple[Rows, list[str]]:

@@ -26,6 +26,7 @@ from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.snapshot import SavedMap
+from l1slam_ros.io.bounded import open_regular
 from l1slam_ros.io.files import other_kind, put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph_file
 from l1slam_ros.io.graphs.left_out import SUSPECT, left_out_by
@@ -104,7 +105,8 @@ def keep_as(path: Path, another: Path) -> None:
 def is_map(path: Path) -> bool:
     """Tell whether a file is a saved map, whole, as it was written."""
     try:
-        return is_proven(path, path.read_bytes())
+        with open_regular(path) as file:
+            return is_proven(path, file.read())
     except (FileError, OSError):
         return False
 

@@ -133,11 +133,7 @@ def named_loops(path: str | os.PathLike[str], what: str, ids: Indices,
     named, numbers = read_pairs(path, what)
     if not len(named):
         return np.zeros(len(factors), bool)
-    # Ids have up to 64 bits, so pairs of them are numbered.
-    both = np.sort(np.concatenate((ids[factors.pairs], named)), axis=1)
-    number = np.unique(both, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0: (m, 1)
-    edges = number[:len(factors)]
-    chosen = number[len(factors):]
+    edges, chosen = _numbered(ids, factors, named)
     # Odometry cannot be struck out; to ignore such a line would be misleading.
     kind, known = ('loop', edges[~factors.is_odometry]) if what == 'struck' else ('edge', edges)
     unknown = ~np.isin(chosen, known)
@@ -146,6 +142,23 @@ def named_loops(path: str | os.PathLike[str], what: str, ids: Indices,
         raise FileError(beside(path, what), f'no {kind} between {named[k, 0]} and {named[k, 1]} '
                         f'in {path}; expected its {what} loops, or no such file', numbers[k])
     return np.asarray(np.isin(edges, chosen) & ~factors.is_odometry)
+
+
+def loops_between(ids: Indices, factors: BetweenFactors, named: Indices) -> Mask:
+    """Return which factors are loops between pairs of vertices `named` (k, 2), (m,) bool."""
+    if not len(named):
+        return np.zeros(len(factors), bool)
+    edges, chosen = _numbered(ids, factors, named)
+    return np.asarray(np.isin(edges, chosen) & ~factors.is_odometry)
+
+
+def _numbered(ids: Indices, factors: BetweenFactors,
+              named: Indices) -> tuple[Indices, Indices]:
+    """Return a number for the vertices of each factor (m,), and of each pair of ids (k,)."""
+    # Ids have up to 64 bits, so pairs of them are numbered.
+    both = np.sort(np.concatenate((ids[factors.pairs], named)), axis=1)
+    number = np.unique(both, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0: (m, 1)
+    return number[:len(factors)], number[len(factors):]
 
 
 def read_pairs(path: str | os.PathLike[str], what: str) -> tuple[Indices, list[int]]:

@@ -27,10 +27,16 @@ Priors are absolute factors; a component with a zero row and column in the infor
 measured. The number after the id of a prior in space is that of a `PARAMS_SE3OFFSET`, the pose of
 the sensor on the robot; only the identity is supported.
 
+`EQUIV i j` of TORO says that two vertices are one place: the loops between them are true. TORO
+collapses the edge between them; here it is vouched for, and both vertices stay. Without such an
+edge their poses are tied to each other. Lines of unknown tags are not used; what ties poses is
+refused: unknown edges, and lines that begin with the ids of two vertices.
+
 **TORO orders the information of the plane differently** (forward, sideways, rotation: `ff fs ss rr
-fr sr`). **The rotation error of g2o in space is the vector part of the quaternion**, half the
-angle: the rotation block of its information is four times that of the angle, and the blocks beside
-it are twice. Some programs that write g2o ignore that; TORO's information is that of the angles.
+fr sr`); some programs write g2o's order under TORO's tags. **The rotation error of g2o in space is
+the vector part of the quaternion**, half the angle: the rotation block of its information is four
+times that of the angle, and the blocks beside it are twice. Some programs that write g2o ignore
+that; TORO's information is that of the angles.
 """
 
 from collections.abc import Callable
@@ -101,6 +107,8 @@ def _triangle(size: int) -> tuple[tuple[int, int], ...]:
 
 
 _TORO_PLANE = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
+# Order of a whole information matrix in the plane -> the other one in use.
+OTHER_ORDER = {_triangle(3): _TORO_PLANE, _TORO_PLANE: _triangle(3)}
 
 # The first tag of each kind on each manifold is g2o's, which is written.
 TAGS = {
@@ -125,9 +133,11 @@ FACTORS = 'between', 'switched', 'absolute', 'position'
 # g2o needs this line for absolute poses in space: an offset of zero.
 OFFSET = 'PARAMS_SE3OFFSET'
 NO_OFFSET = f'{OFFSET} 0 0 0 0 0 0 0 1'
+EQUIVALENT = 'EQUIV'
 
 _LANDMARKS = 'landmarks are no part of a pose graph'
 SENSORS = 'sensor data and calibration are no part of a pose graph'
+UNKNOWN = 'unknown tags'
 # Tags that are known but not used, with the reason; so are PARAMS_... and FIX.
 TAGS_LEFT_OUT = {
     **dict.fromkeys((
@@ -146,6 +156,7 @@ TAGS_LEFT_OUT = {
     **dict.fromkeys(('VERTEX_SWITCH', 'EDGE_SWITCH_PRIOR'),
                     'which loops are true is judged here'),
     **dict.fromkeys((
-        'ROBOTLASER1', 'RAWLASER1', 'FRONTLASER1', 'REARLASER1', 'VERTEX_TAG', 'VERTEX_ELLIPSE',
+        'LASER_ROBOT_DATA', 'RGBD_DATA', 'ROBOTLASER1', 'RAWLASER1', 'FRONTLASER1', 'REARLASER1',
+        'VERTEX_TAG', 'VERTEX_ELLIPSE',
     ), SENSORS),
 }

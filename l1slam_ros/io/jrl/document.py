@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from l1slam_ros.core.errors import FileError, optional_libraries
+from l1slam_ros.io.bounded import read_bytes, unpacked_name
 from l1slam_ros.io.files import LARGEST, counted, quoted, reported
 
 # [bytes] Of a graph of half a million factors. Python takes thirty times as much at worst.
@@ -123,10 +124,7 @@ def read_document(path: Path) -> Node:
 
     """
     with reported(path, 'read'):
-        size = path.stat().st_size
-        if size > _LARGEST_FILE:
-            raise FileError(path, f'{size:,} bytes; expected at most {_LARGEST_FILE:,}')
-        content = path.read_bytes()
+        content = read_bytes(path, _LARGEST_FILE)
     return Node((_from_cbor if is_cbor(path) else _from_json)(path, content), path)
 
 
@@ -139,7 +137,7 @@ def document_bytes(path: Path, value: Any) -> bytes:
 
 def is_cbor(path: Path) -> bool:
     """Tell whether a file is read as CBOR, by its name."""
-    return path.suffix.lower() == CBOR_SUFFIX
+    return unpacked_name(path).endswith(CBOR_SUFFIX)
 
 
 def cbor_library() -> Any:

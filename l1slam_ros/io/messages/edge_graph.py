@@ -33,6 +33,9 @@ from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.io.graphs.robots import keyframes_of, robots_of
 from l1slam_ros.io.messages.conversion import checked_pose3
 
+# Numbers of keyframes are kept in 64 bits with a sign.
+_LAST_NUMBER = 2**63 - 1
+
 
 class Edge(NamedTuple):
     """An edge between two keyframes; pose3 (7,); covariance (6, 6), zeros where not stated."""
@@ -67,8 +70,9 @@ class EdgeGraph(ABC):
         """
         Yield the new loops of a message, and an error for each that cannot be used.
 
-        The causes of errors are those of `conversion`, and `robot` and `keyframe`: a loop between
-        robots, or of a keyframe without a known stamp. The method `graph` has such loops, too.
+        The causes of errors are those of `conversion`, `number`: a number beyond 63 bits, and
+        `robot` and `keyframe`: a loop between robots, or of a keyframe without a known stamp. The
+        method `graph` has the loops of the last two.
 
         topic : that of the message
         """
@@ -88,6 +92,9 @@ class EdgeGraph(ABC):
             return
         self._edges[key] = None
         try:
+            if key[1] > _LAST_NUMBER:
+                raise MessageError('number', f'an edge of keyframe {key[1]}; expected numbers up '
+                                   'to 2^63 - 1')
             pose3 = checked_pose3(told.position, told.orientation)
             self._edges[key] = edge = Edge(told.i, told.j, key[2], pose3, told.covariance)
             if edge.is_loop:

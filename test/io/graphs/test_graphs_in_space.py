@@ -141,8 +141,8 @@ EDGE_SE3_PRIORXY 7 4 5 20 0 20
 def test_position_fixes_of_hdl_graph_slam(write, tmp_path):
     """Those without a height say nothing of it; the floor it saw is no part of a pose graph."""
     record = read_graph_file(write(SQUARE + FIXES))
-    assert [sentence.split()[1] for sentence in record.skipped] == [
-        "'VERTEX_PLANE'", "'EDGE_SE3_PLANE'"]
+    sentence, = record.skipped
+    assert "1 'VERTEX_PLANE', 1 'EDGE_SE3_PLANE'" in sentence
     for _ in range(2):
         factors = record.graph.between
         assert factors.i.tolist() == [0, WORLD, WORLD] and factors.j.tolist() == [1, 0, 1]
@@ -160,7 +160,7 @@ def test_loops_that_could_be_switched_off_are_loops(write):
         'EDGE_SE3:QUAT 7', 'PARAMS_SE3OFFSET 4 0 0.5 0 0 0 0 1\nVERTEX_SWITCH 4 1\n'
         'EDGE_SWITCH_PRIOR 4 1 1.0\nEDGE_SE3_SWITCHABLE 7')
     record, expected = (read_graph_file(write(content)) for content in (lines, plain))
-    assert record.ids.tolist() == [3, 7] and len(record.skipped) == 2
+    assert record.ids.tolist() == [3, 7] and len(record.skipped) == 1
     for name in 'i', 'j', 'measurement', 'sqrt_information':
         assert_array_equal(getattr(record.graph.between, name),
                            getattr(expected.graph.between, name))

@@ -39,7 +39,8 @@ SOUND = ['V 7 POSE', 'V 3 POSE', 'E 3 7 POSE INFO', 'V 9 POSE', 'E 7 9 POSE INFO
 
 @pytest.mark.parametrize('name', FORMATS)
 @pytest.mark.parametrize(('line', 'message'), [
-    ('E 3 7 POSE', 'E: {few} fields; expected 2 whole and {edge} finite numbers'),
+    ('E 3 7 POSE', 'E: {few} fields, the information is missing; expected 2 whole and {edge} '
+     'finite numbers, or the option `--information X`'),
     ('E 3 7 POSE INFO 1', 'E: {many} fields; expected 2 whole and {edge} finite numbers'),
     ('E 3 7 # POSE INFO', 'E: 2 fields; expected 2 whole'),
     ('V 5 0 0', 'V: 3 fields; expected 1 whole and {vertex} finite numbers'),
@@ -57,8 +58,8 @@ SOUND = ['V 7 POSE', 'V 3 POSE', 'E 3 7 POSE INFO', 'V 9 POSE', 'E 7 9 POSE INFO
     ('V 7 POSE', 'vertex 7 comes twice, first at line 1; expected each once'),
     ('OTHER 5 6', 'OTHER: a line of SE{beside} beside V at line 1; expected all poses in the '
      'plane, or all in space'),
-    *((f'{tag} 5 6', f'unknown tag {tag!r}; expected VERTEX_SE2, EDGE_SE2, ')
-      for tag in ('EGDE_SE2', 'VERTEX_SE3:EXPMAP'))])
+    *((f'{tag} 3 7', f'unknown tag {tag!r}; expected VERTEX_SE2, EDGE_SE2, ')
+      for tag in ('EGDE_SE2', 'EDGE_SE3:EXPMAP', 'Vertex2'))])
 def test_each_malformed_line_is_named(tmp_path, name, line, message):
     of, path = FORMATS[name], tmp_path / 'a.g2o'
     words = {'V': of.vertex, 'E': of.edge, 'POSE': of.pose, 'TAIL': of.pose[2:],

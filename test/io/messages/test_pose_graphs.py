@@ -10,6 +10,7 @@
 
 import numpy as np
 import pytest
+from command import run
 from messages import odometry, of_rosbags
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -219,6 +220,24 @@ def test_from_a_bag_come_the_loops_or_the_whole_graph(bag, truth, topic):
     assert np.allclose(se2.residual(factors.measurement, truth[factors.i], truth[factors.j]), 0)
     sigma = 1 / np.diagonal(factors.sqrt_information, axis1=1, axis2=2)
     assert np.allclose(sigma, SIGMA[[0, 1, 5]])
+
+
+@pytest.mark.parametrize('keys', [(6, 2**63), (2**64 - 1, 2**63)])
+def test_a_key_beyond_63_bits_is_one_line(capsys, tmp_path, truth, keys):
+    truth = {k - 1: pose for k, pose in enumerate(truth, 1)} | {
+        key - 1: truth[0] for key in keys[-1:] + keys[:1] if key > 6}
+    with new_bag(tmp_path / 'bag', {}) as writer:
+        types = writer._typestore
+        types.register(FIELDS)
+        writer.add_topic('/pose_graph', POSE_GRAPH)
+        message = pose_graph(20, [(k, 9.0) for k in (*range(1, 7), *keys)], [
+            *(edge(k, k + 1, ODOM, truth) for k in range(1, 6)), edge(*keys, LOOPCLOSE, truth)])
+        writer.write('/pose_graph', SECOND, bytes(types.serialize_cdr(message, POSE_GRAPH)))
+    out, _ = run(capsys, 'info', tmp_path / 'bag', '--odom-topic', '/pose_graph', code=3)
+    assert 'poses       6 in SE2, ids 1 to 6' in out
+    assert f'an edge of keyframe {max(keys)}; expected numbers up to 2^63 - 1' in out
+    _, errors = taken(PoseGraphs(), message)
+    assert errors == ['number']
 
 
 def test_who_read_no_loops_is_told_of_the_graphs(bag):
