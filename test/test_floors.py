@@ -40,7 +40,7 @@ BLIND = {f'{PACKAGE}.core.{name}': {f'{PACKAGE}.core.{other}' for other in other
              'solvers.reweighting': ('graph.factor_graph', 'geometry.se2'),
          }.items()}
 # More in one folder mix responsibilities; one alone needs none.
-MODULES_OF_A_FOLDER = range(2, 13)
+MODULES_OF_A_FOLDER = range(2, 14)
 LONGEST_MODULE = 350
 LONGEST_FUNCTION = 60
 
