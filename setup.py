@@ -71,7 +71,7 @@ setup(
         'report': ['plotly>=5.15'],
         # JRL files in their compressed form; older ones bound less of what strangers write.
         'cbor': ['cbor2>=6.3'],
-        # `l1slam batch`; `table.parquet` besides where pyarrow is.
+        # `l1slam batch --scheduler`; on one machine it needs nothing.
         'fleet': ['distributed>=2024.1'],
         # Newer style tools find other things, and a test asserts that they find none.
         # setuptools: a test builds the wheel, and from 70.1 on it can do so by itself.
@@ -96,7 +96,7 @@ setup(
             'backend = l1slam_ros.ros.executables:backend',
             'scan_loops = l1slam_ros.ros.executables:scan_loops',
             'replay = l1slam_ros.ros.executables:replay',
-            'l1slam = l1slam_ros.cli.main:main',
+            'l1slam = l1slam_ros.cli.entry:main',
         ],
     },
 )

@@ -34,6 +34,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -92,14 +93,13 @@ def whole(folder: Path, output: Path, workers: int) -> float:
     seconds, cpu = time.perf_counter() - began, _cpu_of_children() - cpu
     solving = sum(line['cpu_seconds'] for line in lines(output))
     print(f'{workers} worker(s): code {process.returncode}, {seconds:.1f} s; of the processor '
-          f'{solving:.1f} s for recordings, {cpu:.1f} s besides; load of the machine '
+          f'{solving:.1f} s for recordings, {cpu - solving:.1f} s besides; load of the machine '
           f'{os.getloadavg()[0]:.2f}; {said.strip().splitlines()[-1]}', flush=True)
     return seconds
 
 
 def _cpu_of_children() -> float:
-    """Return the processor time of what this process started, but for that of recordings [s]."""
-    # Who starts the processes that solve leaves their ends to the system, so they do not count.
+    """Return the processor time of what this process started [s]."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
@@ -122,13 +122,13 @@ def pairs(folder: Path, place: Path, count: int) -> None:
 def killed(folder: Path, output: Path, kills: int, seconds: float) -> None:
     """Kill the command so many times while it runs, and each time a worker before; resume."""
     for number in range(kills + 1):
-        before = len(lines(output))
         process = start(folder, output, '--workers', '2', *(['--resume'] if number else []))
         if number < kills:
             time.sleep(seconds / (kills + 1) / 2)
-            # Workers that an earlier command had may be gone, and their numbers others'.
-            for line in lines(output)[before:][-1:]:
-                os.kill(int(line['worker'].rpartition(':')[2]), signal.SIGKILL)
+            begun = Path(f'/proc/{process.pid}/task/{process.pid}/children')
+            for worker in begun.read_text().split()[:1]:
+                with suppress(ProcessLookupError):
+                    os.kill(int(worker), signal.SIGKILL)
             time.sleep(seconds / (kills + 1) / 2)
             process.kill()
         said = process.communicate()[1].strip().splitlines()[-1:] if number == kills else []

@@ -13,7 +13,7 @@ import io
 import json
 import os
 from collections import Counter
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from contextlib import redirect_stderr, redirect_stdout
 from hashlib import sha256
 from typing import Any
 
@@ -22,9 +22,9 @@ from l1slam_ros.cli.main import main
 from l1slam_ros.cli.version import version_text
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.fleet.batch import FAILED, TABLE, Batch, run
+from l1slam_ros.fleet.child import Values
 from l1slam_ros.fleet.isolated import Limits, failed
-from l1slam_ros.fleet.starter import Values, serve
-from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now, cores, load
+from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now, cores
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import say
@@ -57,9 +57,9 @@ def batch(arguments: argparse.Namespace) -> Ending:
         words = [*words, '--params-file', os.path.abspath(arguments.params_file)]
     asked = Batch(
         arguments.folder, arguments.output, tuple(words), about,
-        Limits(arguments.seconds, int(arguments.memory * _GIGABYTE)), arguments.retries,
+        Limits(arguments.seconds, int(arguments.memory * _GIGABYTE), arguments.retries),
         arguments.resume is not None, arguments.resume == 'failed')
-    rows = run(asked, begin, arguments.workers or cores(), arguments.scheduler)
+    rows = run(asked, solve_one, arguments.workers or cores(), arguments.scheduler)
     found = Counter(row['status'] for row in rows)
     of_code = Counter(row['exit_code'] for row in rows)
     table = arguments.output / f'{TABLE}.csv'
@@ -80,22 +80,7 @@ def _words(arguments: argparse.Namespace) -> list[str]:
             '--odom-topic', arguments.odom_topic, '--loop-topic', arguments.loop_topic]
 
 
-def begin() -> None:
-    """Answer jobs, as a process that `fleet.isolated` started."""
-    serve(_prepare, _solve)
-
-
-def _prepare() -> None:
-    """Load what a solve needs, once for all of them."""
-    from l1slam_ros.cli import solving  # noqa: F401
-
-    compile_now((*SPARSE, *JUDGEMENT), quiet=True)
-    load((*SPARSE, *JUDGEMENT))
-    with suppress(ImportError):
-        from l1slam_ros.io.bags import from_graph, to_graph  # noqa: F401
-
-
-def _solve(job: Values) -> Values:
+def solve_one(job: Values) -> Values:
     """Return what the table says of a recording, by the command `l1slam solve`."""
     if os.path.exists(job['input']) and not (
             os.path.isfile(job['input']) or os.path.isdir(job['input'])):

@@ -31,11 +31,12 @@ def add_batch(parser: argparse.ArgumentParser) -> None:
     where('--workers', type=int, metavar='N',
           help='number of recordings solved at once on this machine (default: one for each core)')
     where('--scheduler', metavar='ADDRESS',
-          help='address of a dask scheduler, as tcp://host:8786; its workers must see the same '
-          'files under the same paths')
+          help='address of a dask scheduler, as tls://host:8786; its workers must see the same '
+          'files under the same paths. Needs distributed; doc/fleet.md says how to start one so '
+          'that nobody else can run code on it')
     add('--retries', type=int, default=2, metavar='N',
-        help='how often a recording is tried again after its process or worker was killed '
-        '(default: %(default)s)')
+        help='how often a recording is tried again after its process or worker was killed or '
+        'stalled (default: %(default)s)')
     add('--seconds', type=int, default=600, metavar='S',
         help='processor time that one recording may take; by the clock it may take ten times as '
         'long (default: %(default)s)')

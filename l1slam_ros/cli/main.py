@@ -7,7 +7,6 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """`l1slam`: the core from the command line, without ROS. Parsing, and the exit code."""
-# PYTHON_ARGCOMPLETE_OK
 
 import argparse
 import math

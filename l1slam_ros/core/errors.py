@@ -72,7 +72,7 @@ _OPTIONAL = {
                     'bags are read and written by it, expected `pip install rosbags mcap`'),
     'cbor2': 'JRL files in CBOR are read and written by it, expected `pip install cbor2`',
     **dict.fromkeys(('dask', 'distributed'),
-                    'many recordings are solved on it, expected `pip install distributed`'),
+                    '--scheduler speaks to a cluster by it, expected `pip install distributed`'),
     'matplotlib': 'pictures are drawn by it, expected `pip install matplotlib` or the package '
                   'python3-matplotlib',
 }

@@ -19,18 +19,19 @@ In: what `l1slam batch` was asked. Out: in the folder of the results
 import os
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.fleet.engine import engine, results
+from l1slam_ros.fleet import cluster, isolated
+from l1slam_ros.fleet.child import Values
 from l1slam_ros.fleet.finding import Recording, find
-from l1slam_ros.fleet.isolated import Job, Limits, run_job
+from l1slam_ros.fleet.isolated import Job, Limits, Work
 from l1slam_ros.fleet.journal import Journal, journal
-from l1slam_ros.fleet.starter import Values
 from l1slam_ros.fleet.table import Row, as_csv, as_parquet
 from l1slam_ros.io.files import replacing, reported
 from l1slam_ros.io.progress import Progress
@@ -50,8 +51,7 @@ class Batch:
 
     folder, output : of recordings and of results; arguments : how each is solved, as words of a
     command; about : what the results depend on, values of JSON; limits : what one may take;
-    retries : how often one whose process or worker died is tried again; resume : whether to take
-    up what was begun; again : whether then to try once more what failed.
+    resume : whether to take up what was begun; again : whether then to try once more what failed.
     """
 
     folder: Path
@@ -59,16 +59,16 @@ class Batch:
     arguments: tuple[str, ...]
     about: dict[str, Any]
     limits: Limits
-    retries: int
     resume: bool = False
     again: bool = False
 
 
-def run(batch: Batch, begin: Callable[[], None], workers: int, scheduler: str | None) -> list[Row]:
+def run(batch: Batch, work: Work, workers: int, scheduler: str | None) -> list[Row]:
     """
     Do what is not done yet, and return the rows of the table, which is written by then.
 
-    begin : starts a process that solves, see `isolated.run_job`; workers, scheduler : see `engine`
+    work : solves a recording; workers : how many do so at once on this machine, if scheduler, the
+    address of a cluster's, is None.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def run(batch: Batch, begin: Callable[[], None], workers: int, scheduler: str | 
             with reported(folder):
                 folder.mkdir(parents=True, exist_ok=True)
         if missing:
-            _solve(batch, begin, workers, scheduler, missing, fingerprints, log)
+            _solve(batch, work, workers, scheduler, missing, fingerprints, log)
         for file in _leftovers(batch.output / MAPS):
             os.unlink(file)
         rows = [line['row'] for one in recordings if (line := log.ended(one.name))]
@@ -95,16 +95,19 @@ def run(batch: Batch, begin: Callable[[], None], workers: int, scheduler: str | 
     return rows
 
 
-def _solve(batch: Batch, begin: Callable[[], None], workers: int, scheduler: str | None,
+def _solve(batch: Batch, work: Work, workers: int, scheduler: str | None,
            missing: list[Recording], fingerprints: dict[str, list[list[int]]],
            log: Journal) -> None:
     jobs = (Job(one.name, os.path.abspath(one.path), os.path.abspath(_map(batch, one)),
                 batch.arguments) for one in missing)
-    work = partial(_work, begin, batch.limits, batch.retries)
-    with (engine(min(workers, len(missing)), scheduler) as client,
-          Progress(len(missing), 'recording', label='solving') as progress):
+    limits = batch.limits
+    results = (isolated.results(work, jobs, limits, workers) if scheduler is None else
+               cluster.results(scheduler, partial(_on_worker, work, limits), jobs,
+                               limits.retries, limits.stall))
+    # Closed before anything else happens, so that an interrupt leaves no process behind.
+    with closing(results), Progress(len(missing), 'recording', label='solving') as progress:
         failures = 0
-        for job, ended in results(client, work, jobs, batch.retries):
+        for job, ended in results:
             row = ended['row']
             if row['status'] != FAILED:
                 row['map'] = f'{MAPS}/{job.name}.g2o'
@@ -114,8 +117,10 @@ def _solve(batch: Batch, begin: Callable[[], None], workers: int, scheduler: str
             progress.advance(1, f'{failures:,} failed' if failures else '')
 
 
-def _work(begin: Callable[[], None], limits: Limits, retries: int, job: Job) -> Values:
-    return run_job(begin, job, limits, retries)
+def _on_worker(work: Work, limits: Limits, job: Job) -> Values:
+    """Do one job on a worker of a cluster, which only waits for the process that does it."""
+    [(_, ended)] = isolated.results(work, [job], limits, 1)
+    return ended
 
 
 def _require_own(batch: Batch) -> None:

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.fleet.starter import Values
+from l1slam_ros.fleet.child import Values
 from l1slam_ros.io.files import reported
 from l1slam_ros.io.ours import PROGRAM
 

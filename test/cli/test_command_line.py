@@ -146,6 +146,41 @@ def test_a_signal_leaves_nothing_half_written(graph, name):
     assert [path.name for path in graph.parent.iterdir()] == ['graph.g2o']
 
 
+# Interrupts a process amid an import, a call from machine code, or a destructor: `point` of them.
+INTERRUPT = """
+import signal, sys
+
+class Last:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+def now():
+    came.append(point)
+    if point == 'destructor':
+        Last()
+    else:
+        signal.raise_signal(signal.SIGINT)
+
+came, point = [], sys.argv.pop(1)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.addaudithook(lambda event, about: now() if not came and event == 'import' and about[0] == {
+    'destructor': 'numpy'}.get(point, point) else None)
+sys.setprofile(lambda frame, event, called: now() if not came and event == 'c_call' and
+               f'{called.__module__}.{called.__name__}' == point else None)
+from l1slam_ros.cli.entry import main
+code = main()
+sys.exit(code if came else 'not reached')
+"""
+
+
+@pytest.mark.parametrize('point', ['argparse', 'numpy', 'datetime', 'llvmlite', '_pickle.loads',
+                                   'destructor'])
+def test_an_interrupt_at_any_time_is_no_traceback(graph, point):
+    """NumPy and machine code make errors of their own of one, and destructors hide it."""
+    done = l1slam(point, 'solve', graph, code=INTERRUPT)
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
+
+
 def test_a_notebook_may_draw(graph):
     inline = os.environ | {'MPLBACKEND': 'of_another_environment'}
     done = l1slam('plot', graph, '--output', graph.with_suffix('.png'), env=inline)

@@ -14,49 +14,38 @@ import sys
 from pathlib import Path
 
 from l1slam_ros.cli import batching
-from l1slam_ros.fleet.starter import serve
 
 
-def begin():
-    serve(lambda: None, lambda job: globals()[job['arguments'][0]](Path(job['output'])))
-
-
-def begin_prepared():
+def prepared(job):
     """Answer with the status of what a job of `batch` solves, and if numba was needed."""
-    def work(job):
-        return {**batching._solve(job), 'numba': 'numba' in sys.modules}
-
-    serve(batching._prepare, work)
+    return {**batching.solve_one(job), 'numba': 'numba' in sys.modules}
 
 
-def bomb(output):
+def bomb(job):
     kept = [bytearray(10**9) for _ in range(100)]
     return {'status': len(kept)}
 
 
-def endless(output):
+def endless(job):
     while True:
         pass
 
 
-def clock(output):
+def clock(job):
     signal.raise_signal(signal.SIGALRM)
 
 
-def crash(output):
+def crash(job):
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
-def crash_once(output):
-    if not output.exists():
-        output.touch()
-        crash(output)
-    return {'status': 'converged'}
+def stop(job):
+    os.kill(os.getpid(), signal.SIGSTOP)
 
 
-def end_all_once(output):
-    """As where the machine is short of memory and its kernel picks the parent."""
+def crash_once(job):
+    output = Path(job['output'])
     if not output.exists():
         output.touch()
-        os.kill(os.getppid(), signal.SIGKILL)
+        crash(job)
     return {'status': 'converged'}

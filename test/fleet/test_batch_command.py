@@ -15,20 +15,17 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
+import bad_jobs
 import pytest
-
-pytest.importorskip('distributed')
-
-from bad_jobs import begin, begin_prepared
 from command import run
 
 from l1slam_ros.core.kernels.kept import objects
-from l1slam_ros.fleet import isolated
 from l1slam_ros.fleet.finding import find
-from l1slam_ros.fleet.isolated import Job, Limits, run_job
+from l1slam_ros.fleet.isolated import Job, Limits, results
 from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, fill_cache
 
 DASK = [sys.executable, '-m', 'distributed.cli.dask_']
@@ -60,13 +57,35 @@ def done(recordings, tmp_path_factory):
     return output, ended.stderr.read()
 
 
-def command(folder, output, *options):
+def command(folder, output, *options, **environment):
     """Start the command on two workers."""
     where = () if {'--scheduler', '--workers'} & {*options} else ('--workers', '2')
     return subprocess.Popen(
-        [sys.executable, '-c', 'import sys; from l1slam_ros.cli.main import main; '
-         'sys.exit(main())', 'batch', folder, '--output', output, *where, *options],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        [sys.executable, '-c', 'import signal, sys; from l1slam_ros.cli.entry import main; '
+         'signal.signal(signal.SIGINT, signal.default_int_handler); sys.exit(main())', 'batch',
+         folder, '--output', output, *where, *options],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment)
+
+
+def children(process):
+    """Return the numbers of the processes of a command that solve."""
+    known = Path(f'/proc/{process.pid}/task/{process.pid}/children')
+    if not Path(f'/proc/{os.getpid()}/task/{os.getpid()}/children').exists():
+        pytest.skip('this system does not say which processes a process has begun')
+    found = []
+    for number in known.read_text().split():
+        with suppress(OSError):
+            if b'fleet.child' in Path(f'/proc/{number}/cmdline').read_bytes():
+                found.append(int(number))
+    return found
+
+
+def at_work(process):
+    """Wait until a command has begun to solve; return the numbers of those who do."""
+    while not (found := children(process)):
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(.002)
+    return found
 
 
 def rows(output):
@@ -144,32 +163,118 @@ def test_what_a_kill_left_undone_is_done_and_no_more(recordings, done, tmp_path)
 def test_a_worker_that_is_killed_costs_nothing(recordings, done, tmp_path):
     output = tmp_path / 'results'
     ended = command(recordings, output)
-    for line in until_one_is_done(ended, output)[-1:]:
-        os.kill(int(line['worker'].rpartition(':')[2]), signal.SIGKILL)
-    assert ended.wait(SECONDS) == 3
+    for number in at_work(ended):
+        os.kill(number, signal.SIGKILL)
+    said = ended.communicate(timeout=SECONDS)[1]
+    assert ended.returncode == 3
+    assert 'signal 9, Killed; tried again' in said
     assert files(output) == files(done[0])
 
 
-def test_a_scheduler_and_a_worker_of_their_own_do_the_same(recordings, done, tmp_path):
-    where = tmp_path / 'scheduler.json'
-    quiet = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL, 'cwd': tmp_path}
-    others = [subprocess.Popen([*DASK[:2], f'{DASK[2]}scheduler', '--host', '127.0.0.1', '--port',
-                                '0', '--no-dashboard', '--scheduler-file', where], **quiet)]
+def test_nobody_else_can_reach_it(recordings, tmp_path):
+    """No process of it has a socket, and what lies in the folder of all is not touched."""
+    scratch = tmp_path / 'dask-scratch-space'
+    scratch.mkdir()
+    scratch.chmod(0o777)
+    running = command(recordings, tmp_path / 'results', TMPDIR=str(tmp_path))
+    numbers = [running.pid, *at_work(running)]
+    until_one_is_done(running, tmp_path / 'results')
+    for number in {*numbers, *children(running)}:
+        for descriptor in Path(f'/proc/{number}/fd').glob('*'):
+            # What has ended meanwhile has none.
+            assert not (descriptor.is_symlink() and 'socket' in os.readlink(descriptor))
+    assert not list(scratch.iterdir())
+    assert running.wait(SECONDS) == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['dask-scratch-space', 'results']
+
+
+def test_ctrl_c_ends_all_of_it(recordings, tmp_path):
+    running = command(recordings, tmp_path / 'results')
+    numbers = at_work(running)
+    running.send_signal(signal.SIGINT)
+    out, said = running.communicate(timeout=SECONDS)
+    assert (running.returncode, out, said) == (130, '', '')
+    assert not any(Path(f'/proc/{number}').exists() for number in numbers)
+
+
+@pytest.fixture
+def odd(recordings, tmp_path):
+    """A folder with a recording whose name is no text."""
+    folder = tmp_path / 'odd'
+    folder.mkdir()
     try:
-        while not where.exists():
+        shutil.copy(recordings / 'a.g2o', os.fsencode(folder) + b'/n\xff.g2o')
+    except OSError:
+        pytest.skip('names of files are text here')
+    return folder
+
+
+def is_done(output):
+    """Tell whether the recording whose name is no text has its map and its row."""
+    return (os.path.exists(os.fsencode(output) + b'/maps/n\xff.g2o.g2o')
+            and {name: row['status'] for name, row in rows(output).items()} == {
+                r'n\udcff.g2o': 'converged'})
+
+
+def test_a_name_that_is_no_text_has_its_map(odd, tmp_path, capsys):
+    run(capsys, 'batch', odd, '--output', tmp_path / 'results', '--workers', '1')
+    assert is_done(tmp_path / 'results')
+
+
+@contextmanager
+def cluster(folder, *options, **environment):
+    """Yield the address of a scheduler with a worker."""
+    pytest.importorskip('distributed')
+    where = folder / 'scheduler.json'
+    (folder / 'private').mkdir(0o700)
+    quiet = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL, 'cwd': folder,
+             'env': os.environ | environment | {'DASK_TEMPORARY_DIRECTORY': folder / 'private'}}
+    others = [subprocess.Popen([*DASK[:2], f'{DASK[2]}scheduler', '--host', '127.0.0.1', '--port',
+                                '0', '--no-dashboard', '--scheduler-file', where, *options],
+                               **quiet)]
+    try:
+        while not where.exists() or not where.read_text():
             assert others[0].poll() is None
             time.sleep(.05)
         others.append(subprocess.Popen(
             [*DASK[:2], f'{DASK[2]}worker', '--scheduler-file', where, '--nthreads', '2',
              '--no-dashboard', '--host', '127.0.0.1'], **quiet))
-        address = json.loads(where.read_text())['address']
-        ended = command(recordings, tmp_path / 'results', '--scheduler', address)
-        assert ended.wait(SECONDS) == 3, ended.stderr.read()
+        yield json.loads(where.read_text())['address']
+        assert os.listdir(folder / 'private') == ['dask-scratch-space']
     finally:
         for other in others[::-1]:
             other.terminate()
             other.wait(SECONDS)
+
+
+def test_a_scheduler_and_a_worker_of_their_own_do_the_same(recordings, done, tmp_path):
+    """By TLS, with a certificate that dask's own configuration names, and in no other way."""
+    if not shutil.which('openssl'):
+        pytest.skip('openssl is not installed')
+    key, certificate = tmp_path / 'key.pem', tmp_path / 'certificate.pem'
+    subprocess.run(['openssl', 'req', '-x509', '-newkey', 'rsa:2048', '-nodes', '-days', '1',
+                    '-subj', '/CN=fleet', '-keyout', key, '-out', certificate], check=True,
+                   stderr=subprocess.DEVNULL)
+    tls = {'CA_FILE': certificate, **{f'{who}__{what}': path for who in (
+        'CLIENT', 'SCHEDULER', 'WORKER') for what, path in (('CERT', certificate), ('KEY', key))}}
+    known = {f'DASK_DISTRIBUTED__COMM__TLS__{name}': str(path) for name, path in tls.items()}
+    with cluster(tmp_path, '--protocol', 'tls', **known) as address:
+        assert address.startswith('tls://')
+        stranger = command(recordings, tmp_path / 'none', '--scheduler', address)
+        said = stranger.communicate(timeout=SECONDS)[1]
+        assert stranger.returncode == 2 and said.count('\n') == 1 and 'TLS' in said
+        ended = command(recordings, tmp_path / 'results', '--scheduler', address, **known)
+        said = ended.communicate(timeout=SECONDS)[1]
+        assert ended.returncode == 3 and 'tls://' not in said, said
     assert files(tmp_path / 'results') == files(done[0])
+
+
+def test_a_scheduler_without_tls_is_warned_of(odd, tmp_path):
+    with cluster(tmp_path) as address:
+        ended = command(odd, tmp_path / 'results', '--scheduler', address)
+        said = ended.communicate(timeout=SECONDS)[1]
+        assert ended.returncode == 0, said
+    assert 'not tls://' in said and is_done(tmp_path / 'results')
 
 
 def test_what_changed_and_what_failed_is_done_again(recordings, done, tmp_path, capsys):
@@ -219,39 +324,49 @@ def test_it_is_taken_up_as_it_was_begun_or_not_at_all(recordings, done, capsys):
     assert (done[0] / 'log.jsonl').read_bytes() == before
 
 
-def test_without_dask_one_sentence_says_what_to_install(
-        recordings, tmp_path, capsys, monkeypatch):
+def test_dask_is_needed_for_a_cluster_alone(recordings, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, 'dask', None)
-    said = run(capsys, 'batch', recordings, '--output', tmp_path / 'results', code=2)[1]
-    assert said.count('\n') == 1 and 'pip install distributed' in said
+    said = run(capsys, 'batch', recordings, '--output', tmp_path / 'results', '--scheduler',
+               'tls://localhost:1', code=2)[1]
+    assert said.count('\n') == 1 and '--scheduler' in said and 'pip install distributed' in said
+    run(capsys, 'batch', recordings / 'deep', '--output', tmp_path / 'others', code=3)
 
 
 @pytest.mark.parametrize(('options', 'sentence'), [
     (('--workers', '0'), '--workers is 0'), (('--retries', '-1'), '--retries is -1'),
     (('--seconds', '0'), '--seconds is 0'), (('--memory', 'nan'), '--memory is nan'),
-    (('--scheduler', 'nowhere://x'), 'nobody answers')])
+    (('--scheduler', 'nowhere://x'), 'nobody answers'),
+    (('--scheduler', 'tls://localhost:1'), 'nobody answers')])
 def test_what_cannot_be_asked_for_is_refused(recordings, tmp_path, capsys, options, sentence):
+    if '--scheduler' in options:
+        pytest.importorskip('distributed')
     said = run(capsys, 'batch', recordings, '--output', tmp_path / 'results', *options, code=2)[1]
     assert sentence in said and said.count('\n') == 1
+
+
+def ended(work, job, limits):
+    [(_, found)] = results(work, [job], limits, 1)
+    return found
 
 
 @pytest.mark.parametrize(('what', 'sentence'), [
     ('bomb', 'ended with code 1 and said nothing, 2 times'),
     ('endless', 'took more than 1 s of the processor'), ('clock', 'took more than 10 s by the'),
-    ('crash', 'ended by signal 11, Segmentation fault, 2 times')])
-def test_what_ends_a_process_is_said(tmp_path, what, sentence):
-    job = Job('name', 'input', str(tmp_path / 'map'), (what,))
-    seconds = 60 if what == 'bomb' else 1
-    row = run_job(begin, job, Limits(seconds, 2 * 10**9), 1)['row']
+    ('crash', 'ended by signal 11, Segmentation fault, 2 times'),
+    ('stop', 'stalled: no sign of life for 1 s, 2 times')])
+def test_what_ends_a_process_is_said(tmp_path, capsys, what, sentence):
+    job = Job('name', 'input', str(tmp_path / 'map'))
+    limits = Limits(60 if what == 'bomb' else 1, 2 * 10**9, 1, 1 if what == 'stop' else 60)
+    row = ended(getattr(bad_jobs, what), job, limits)['row']
     assert row['recording'] == 'name' and row['status'] == 'failed'
     assert sentence in row['sentence']
+    assert ('tried again' in capsys.readouterr().err) == ('2 times' in sentence)
 
 
-@pytest.mark.parametrize('what', ['crash_once', 'end_all_once'])
-def test_what_crashes_once_is_tried_again(tmp_path, what):
-    job = Job('name', 'input', str(tmp_path / 'map'), (what,))
-    ended = run_job(begin, job, Limits(1, 2 * 10**9), 1)
-    assert ended['row'] == {'recording': 'name', 'status': 'converged'} and ended['attempts'] == 2
+def test_what_crashes_once_is_tried_again(tmp_path):
+    job = Job('name', 'input', str(tmp_path / 'map'))
+    found = ended(bad_jobs.crash_once, job, Limits(60, 2 * 10**9, 1))
+    assert found['row'] == {'recording': 'name', 'status': 'converged'} and found['attempts'] == 2
 
 
 def states():
@@ -264,12 +379,10 @@ def test_a_job_compiles_nothing_once_the_cache_is_full(recordings, tmp_path, mon
     """Whatever a worker's environment says of the threads of loops, of which none has many."""
     assert fill_cache(lambda done, total: None, lambda: False, (*SPARSE, *JUDGEMENT))
     before = states()
-    monkeypatch.setattr(isolated, '_STARTERS', threading.local())  # no process that is there
     if threads:
         monkeypatch.setenv('NUMBA_NUM_THREADS', threads)
     job = Job('a', str(recordings / 'a.g2o'), str(tmp_path / 'map.g2o'))
-    row = run_job(begin_prepared, job, Limits(SECONDS, 10**10), 0)['row']
-    isolated._STARTERS.of[begin_prepared].close()
+    row = ended(bad_jobs.prepared, job, Limits(SECONDS, 10**10, 0))['row']
     assert row['status'] != 'failed' and not row['numba']
     assert before and states() == before
 

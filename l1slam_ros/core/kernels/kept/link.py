@@ -15,6 +15,7 @@ itself. If anything is unexpected there is no function, and the caller uses numb
 
 import builtins
 import ctypes
+import functools
 import importlib.machinery
 import importlib.util
 import pickle
@@ -183,15 +184,15 @@ def _teach_to_unpickle(address: int) -> None:
     finally:
         if sys.modules.get(name) is stand_in:
             del sys.modules[name]
-    _pickled.clear()
+    _unpickled.cache_clear()
 
 
-_pickled: dict[tuple[int, bytes], object] = {}
-
-
+@functools.cache
 def _unpickled(address: int, data: bytes, digest: bytes) -> object:
-    """Return the object that machine code has pickled at an address, always the same one."""
-    where = address, digest
-    if where not in _pickled:
-        _pickled[where] = pickle.loads(data)
-    return _pickled[where]
+    """
+    Return the object that machine code has pickled at an address, always the same one.
+
+    It is called in the midst of machine code, which makes nothing of a signal's exception: once
+    it is known, it is found without the interpreter, where no handler of a signal can run.
+    """
+    return pickle.loads(data)
