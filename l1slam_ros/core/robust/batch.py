@@ -63,7 +63,8 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.as_measured import FAILURES, Believed, OnRound, as_measured
-from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
+from l1slam_ros.core.robust.forecast import CONFIDENT, drift_taken_for_noise, right_within
+from l1slam_ros.core.robust.gating import log_odds_of_false, probability
 from l1slam_ros.core.robust.innovation import BY_CHANCE, chi2_quantile, covariances, spread_of
 from l1slam_ros.core.robust.inspection import OFF_SCALE
 from l1slam_ros.core.robust.judgement import (
@@ -121,9 +122,10 @@ def robust_solve(
         for number, growth in enumerate(rounds(first, repair), 1):
             last = so_far(growth, repair.drift), growth.poses
             report(number, int(np.count_nonzero(growth.loops)))
-        growth, uncontested = with_uncontested(growth)
-        reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival, uncontested)
-        return judgement_of(growth, reasons, drift=repair.drift, odds=repair.odds), growth.poses
+        growth, uncontested, sure = with_uncontested(growth)
+        unconfirmed = uncontested[:0] if sure >= CONFIDENT else uncontested
+        reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival, unconfirmed)
+        return judgement_of(growth, reasons, repair.drift, repair.odds, sure), growth.poses
     except FAILURES as error:
         judgement, poses = known or last
         return judgement.broken_off(graph, error), poses
@@ -315,24 +317,31 @@ def rounds(
     growth.accept_tail()
 
 
-def with_uncontested(growth: Growth) -> tuple[Growth, Indices]:
+def with_uncontested(growth: Growth) -> tuple[Growth, Indices, float]:
     """
-    Return a state with the loops that are left out, where all fit the map and each other, (k,).
+    Return a state with the loops that are left out, where all fit the map and each other.
 
     Then nothing is an outlier but by the prior: few loops against uncertain odometry, which false
-    ones would fit as well. The likelier map has them; that they are unconfirmed is a doubt.
+    ones would fit as well. The likelier map has them. Also which they are, (k,), and how likely it
+    is that none is an outlier; a place may be one mistake, so it counts once.
     """
     given = growth.given
     rows = np.flatnonzero(given.is_loop & ~growth.accepted)
     if not len(rows) or growth.across()[rows].any() or (growth.cut & ~given.gap).any():
-        return growth, rows[:0]
+        return growth, rows[:0], 1.0
     found = growth.innovations(rows)
     if (found.square >= given.gate(found.freedom)).any():
-        return growth, rows[:0]
+        return growth, rows[:0], 1.0
     state = growth.copy()
     state.accepted[rows] = True
     state.solve()
-    return (state, rows) if state.accepted[rows].all() else (growth, rows[:0])
+    if not state.accepted[rows].all():
+        return growth, rows[:0], 1.0
+    log_ratio = found.log_ratio()
+    odds = log_odds_of_false(log_ratio, 0, int(np.count_nonzero(growth.loops)))
+    false = np.zeros(given.place[rows].max() + 1)
+    np.maximum.at(false, given.place[rows], probability(odds - log_ratio))
+    return state, rows, float(np.prod(1 - false))
 
 
 def judge(

@@ -246,14 +246,15 @@ def so_far(growth: Growth, drift: float = 0.0) -> Judgement:
 
 
 def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float = 0.0,
-                 odds: float = np.inf) -> Judgement:
+                 odds: float = np.inf, sure: float = 1.0) -> Judgement:
     """
     Return what a state says of the factors that were given.
 
     That another drift may be right is no reason where maps that looked like this one were right,
     nor where none is taken that is the likelier by far.
 
-    drift : that of the odometry [rad/m]; odds : ln of those of it against all others
+    drift : that of the odometry [rad/m]; odds : ln of those of it against all others; sure : how
+    likely it is that no loop is an outlier of those that nothing else confirms
     """
     believed = so_far(growth, drift)
     square, suspect = fits(growth)
@@ -271,6 +272,7 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float =
     confidence = forecast(terms) if loops.any() else float('nan')
     if odds < 0:
         confidence = min(confidence, chance)
+    confidence *= sure
     reasons = tuple(
         doubt for doubt in reasons if doubt.kind != DRIFTS or not confidence >= CONFIDENT)
     left_out = np.flatnonzero(loops & ~believed.accepted)

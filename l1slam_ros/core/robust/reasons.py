@@ -37,6 +37,7 @@ from l1slam_ros.core.robust.odometry.slips import SURE, common_steps
 from l1slam_ros.core.robust.odometry.untold import LEAST
 from l1slam_ros.core.robust.pairwise_consistency import (
     NONE,
+    RUN,
     agree_at_a_place,
     longest_run,
     runs,
@@ -86,7 +87,7 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
     hardly is a mistake: it only has to be likelier true than false.
     """
     given = growth.given
-    if (not len(accepted) or not given.may_err_as_one(accepted, TWO_PLACES)
+    if (len(accepted) < RUN or not given.may_err_as_one(accepted, TWO_PLACES)
             or (given.trusted | given.factors.is_absolute)[accepted].any()):
         return False
     odometry = growth.copy()

@@ -135,13 +135,13 @@ def ring(seed, n=600, loops=20, radius=95):
 @pytest.mark.parametrize('seed, loops, doubted', [(2, 20, False), (2, 7, True), (3, 7, False)])
 def test_one_place_that_carries_all_is_doubtful_where_odometry_hardly_bears_it_out(
         seed, loops, doubted):
-    """Seven loops along 1.2 m may be one mistake, as three may; twenty are a run."""
+    """Seven loops along 1.2 m may be one mistake, twenty are a run; a few loops may be one."""
     graph, steps = ring(seed, loops=loops, radius=20)
     found, _ = robust_solve(graph)
     assert found.accepted.all()
     assert [doubt.kind for doubt in found.doubts] == [UNCONFIRMED] * doubted
     few, _ = robust_solve(graph.subset(np.arange(steps + 3)))
-    assert (UNCONFIRMED in [doubt.kind for doubt in few.doubts]) == (seed == 2)
+    assert UNCONFIRMED not in [doubt.kind for doubt in few.doubts]
 
 
 @pytest.mark.parametrize('turn, count', [(0.0, 20), (np.pi / 2, 20), (np.pi / 2, 4)])

@@ -437,7 +437,7 @@ def test_a_loop_is_suspect_until_others_vouch_for_it(monkeypatch):
     a loop that came meanwhile needs no judgement.
     """
     # As while driving: at rest, loops that all fit are accepted with a doubt.
-    monkeypatch.setattr(batch, 'with_uncontested', lambda growth: (growth, NONE))
+    monkeypatch.setattr(batch, 'with_uncontested', lambda growth: (growth, NONE, 1.0))
     backend, truth = Backend(EVERY), roundabout(220)
     drive_roundabout(backend, truth)
     settled(backend)
