@@ -125,14 +125,19 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
             true = to_pose3(truth)
         if scans:
             writer.add_topic(SCAN_TOPIC, SCAN_TYPE)
+        # A simulated drive is recorded as a real one is: no two messages at one time.
+        time, later = 0, int(truth is not None)
         for k, (sample, loops) in enumerate(recorded(graph, stamps)):
             stamp = sample.stamp
-            writer.write(ODOMETRY_TOPIC, stamp, odometry_bytes(
+            time = max(stamp, time + later)
+            writer.write(ODOMETRY_TOPIC, time, odometry_bytes(
                 'odom', _BASE_FRAME, stamp, sample.pose3, sample.covariance))
             if truth is not None:
-                writer.write(TRUTH_TOPIC, stamp, pose_bytes('map', stamp, true[k]))
+                time += later
+                writer.write(TRUTH_TOPIC, time, pose_bytes('map', stamp, true[k]))
             if scans:
-                writer.write(SCAN_TOPIC, stamp, scan_bytes(_BASE_FRAME, scans[k]))
+                time += later
+                writer.write(SCAN_TOPIC, time, scan_bytes(_BASE_FRAME, scans[k]))
             for loop in loops:
                 topic, frame = ABSOLUTE_TOPIC, 'map'
                 # The loop itself was the message before.
@@ -140,7 +145,8 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
                 if loop.reference_stamp is not None:
                     topic = _topic(loop, word)
                     frame = reference_frame_id(_BASE_FRAME, loop.reference_stamp)
-                writer.write(topic, stamp, pose_bytes(frame, stamp, loop.pose3, loop.covariance))
+                time += later
+                writer.write(topic, time, pose_bytes(frame, stamp, loop.pose3, loop.covariance))
 
 
 def _topic(loop: LoopClosure, word: str) -> str:

@@ -25,7 +25,7 @@ import yaml
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from l1slam_ros.io.bags.damaged.salvage import METADATA
+from l1slam_ros.io.bags.bag_files import METADATA
 from l1slam_ros.io.files import dated_names, new_folder_beside, reported, sync_folder
 
 NOTE_KEY = 'l1slam'
