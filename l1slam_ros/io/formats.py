@@ -88,7 +88,7 @@ _ORIGINS: WeakKeyDictionary[FactorGraph, _Origin] = WeakKeyDictionary()
 
 def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
                topics: Topics = DEFAULT_TOPICS, rotation_information: str = QUATERNION,
-               dimension: int = 2) -> GraphRecord:
+               dimension: int = 2, more: Sequence[Path] = ()) -> GraphRecord:
     """
     Read a graph file or grow a graph from a bag.
 
@@ -100,6 +100,7 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
     topics : the topics of a bag
     rotation_information : see `GraphRecord`; the record keeps it for writing
     dimension : of the poses of a bag (2 or 3), unless the bag notes it
+    more : further bags of the drive whose first bag is `path`
 
     Raises
     ------
@@ -112,7 +113,7 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
         with optional_libraries():
             from l1slam_ros.io.bags.to_graph import graph_from_bag
 
-        record = graph_from_bag(path, options, topics, dimension)
+        record = graph_from_bag(path, options, topics, dimension, more)
         return replace(record, rotation_information=rotation_information)
     # `map.g2o.1` is the previous map of the node.
     name = path.name.lower().removesuffix('.1')

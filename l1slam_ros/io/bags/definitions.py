@@ -9,8 +9,8 @@
 """Types for decoding messages: the standard ones, and all others as the bag defines them."""
 
 import re
-from collections.abc import Iterable
 from contextlib import suppress
+from functools import lru_cache
 from typing import Any
 
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
@@ -22,7 +22,9 @@ _IDL_PART = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
 _LONGEST = 2**20  # letters of a definition
 
 
-def types_of(definitions: Iterable[tuple[str, MessageDefinition]], is_ros1: bool = False) -> Any:
+# Files of one bag define the same, and the library makes code of each.
+@lru_cache(maxsize=4)
+def types_of(definitions: tuple[tuple[str, MessageDefinition], ...], is_ros1: bool = False) -> Any:
     """
     Return the types for decoding; of ROS 1, for converting to CDR and decoding that.
 

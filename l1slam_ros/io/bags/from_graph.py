@@ -116,7 +116,8 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
     topics[REJECTED_LOOP_TOPIC] = (np.isin(words, _REFUSED) & ~factors.is_absolute).any()
     note = _note(graph, stamps) | _turned_note(graph, backward) | _left_out_note(graph, words)
     in_order = iter(words[loops_of(graph)].tolist())
-    with new_bag(path, note) as writer:
+    # A simulated drive is recorded as a real one is: no two messages at one time.
+    with new_bag(path, note, apart=truth is not None) as writer:
         writer.add_topic(ODOMETRY_TOPIC, _ODOMETRY)
         for topic in sorted(topic for topic, used in topics.items() if used):
             writer.add_topic(topic, _LOOP)
@@ -125,19 +126,14 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
             true = to_pose3(truth)
         if scans:
             writer.add_topic(SCAN_TOPIC, SCAN_TYPE)
-        # A simulated drive is recorded as a real one is: no two messages at one time.
-        time, later = 0, int(truth is not None)
         for k, (sample, loops) in enumerate(recorded(graph, stamps)):
             stamp = sample.stamp
-            time = max(stamp, time + later)
-            writer.write(ODOMETRY_TOPIC, time, odometry_bytes(
+            writer.write(ODOMETRY_TOPIC, stamp, odometry_bytes(
                 'odom', _BASE_FRAME, stamp, sample.pose3, sample.covariance))
             if truth is not None:
-                time += later
-                writer.write(TRUTH_TOPIC, time, pose_bytes('map', stamp, true[k]))
+                writer.write(TRUTH_TOPIC, stamp, pose_bytes('map', stamp, true[k]))
             if scans:
-                time += later
-                writer.write(SCAN_TOPIC, time, scan_bytes(_BASE_FRAME, scans[k]))
+                writer.write(SCAN_TOPIC, stamp, scan_bytes(_BASE_FRAME, scans[k]))
             for loop in loops:
                 topic, frame = ABSOLUTE_TOPIC, 'map'
                 # The loop itself was the message before.
@@ -145,8 +141,7 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
                 if loop.reference_stamp is not None:
                     topic = _topic(loop, word)
                     frame = reference_frame_id(_BASE_FRAME, loop.reference_stamp)
-                time += later
-                writer.write(topic, time, pose_bytes(frame, stamp, loop.pose3, loop.covariance))
+                writer.write(topic, stamp, pose_bytes(frame, stamp, loop.pose3, loop.covariance))
 
 
 def _topic(loop: LoopClosure, word: str) -> str:

@@ -18,11 +18,11 @@ import os
 from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from math import inf
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from l1slam_ros.core.errors import FileError, L1SlamError
 from l1slam_ros.io.bags.bag_files import (
@@ -138,7 +138,7 @@ def bag_summary(path: str | os.PathLike[str]) -> BagSummary:
     times = list[int]()
     for file in files:
         content = file.content()
-        times += content.times
+        times += content.times or ()
         for (name, msgtype), (count, late) in content.counts.items():
             types[name].add(msgtype)
             counts[name] += count
@@ -247,33 +247,41 @@ def _by_time(files: Sequence[StoredFile], topics: Collection[str] | None, start:
     Yield the messages of all files in order of time.
 
     Of each file one is held in memory, and nothing of a file before its time. Of one time in
-    several files nothing says which came first: they come by topic and content, so that it does
-    not matter how a bag was split.
+    several files nothing says which came first, unless one ends where the next begins: they come
+    by topic and content, so that it does not matter how a bag was split.
     """
     if len(files) == 1:
         yield from files[0].messages(topics, start, stop)
         return
-    begun = [(content.times[0], file) for file in files if (content := file.content()).times]
-    waiting = deque(sorted(begun, key=itemgetter(0)))
-    ahead = list[tuple[Found, Iterator[Found]]]()
+    begun = [(*times, file) for file in files if (times := file.content().times)]
+    waiting = deque(sorted(begun, key=itemgetter(0, 1)))
+    ahead = list[_Ahead]()
     while waiting or ahead:
-        time = min((found[0].time for found, _ in ahead), default=inf)
+        time = min((one.found[0].time for one in ahead), default=inf)
         if waiting and waiting[0][0] <= time:
-            messages = waiting.popleft()[1].messages(topics, start, stop)
-            ahead += [(found, messages) for found in islice(messages, 1)]
+            begin, end, file = waiting.popleft()
+            messages = file.messages(topics, start, stop)
+            ahead += [_Ahead(begin, end, messages, found) for found in islice(messages, 1)]
             continue
-        now = [one for one in ahead if one[0][0].time == time]
-        ahead = [one for one in ahead if one[0][0].time > time]
-        if len(now) == 1:
-            yield now[0][0]
-            ahead += [(found, now[0][1]) for found in islice(now[0][1], 1)]
-            continue
+        now = sorted((one for one in ahead if one.found[0].time == time), key=itemgetter(0, 1))
+        ahead = [one for one in ahead if one.found[0].time > time]
         tied = list[Found]()
-        for found, messages in now:
-            tied.append(found)
-            for following in messages:
+        for one in now:
+            tied.append(one.found)
+            for following in one.messages:
                 if following[0].time > time:
-                    ahead.append((following, messages))
+                    ahead.append(one._replace(found=following))
                     break
                 tied.append(following)
-        yield from sorted(tied, key=lambda one: (one[0].topic, one[0].data))
+        if any(one.end > other.begin for one, other in pairwise(now)):
+            tied.sort(key=lambda one: (one[0].topic, one[0].data))
+        yield from tied
+
+
+class _Ahead(NamedTuple):
+    """A file that is being read: its first and last time [ns], and its next message."""
+
+    begin: int
+    end: int
+    messages: Iterator[Found]
+    found: Found

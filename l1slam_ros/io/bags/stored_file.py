@@ -43,11 +43,12 @@ class FileContent:
     What a file holds, as far as it can be read.
 
     counts : (topic, type) -> how many messages there are, and how many of them its publishers kept
-    for subscribers that come late; times : of the first message and the last one [ns], or empty
+    for subscribers that come late; times : of the first message and the last one [ns], None: there
+    are none
     """
 
     counts: dict[tuple[str, str], tuple[int, int]]
-    times: tuple[int, ...]
+    times: tuple[int, int] | None
 
 
 class StoredFile:
@@ -90,15 +91,15 @@ class StoredFile:
                     counts[key] = count + connection.msgcount, kept + _kept(connection)
                 # Without messages the library's times are its largest and smallest numbers; its
                 # end lies one nanosecond behind the last message.
-                times = ((reader.start_time, reader.end_time - 1) if reader.message_count else ())
-                return FileContent(dict(counts), times)
+                times = reader.start_time, reader.end_time - 1
+                return FileContent(dict(counts), times if reader.message_count else None)
         except Exception as error:  # damaged files make the library raise anything
             self._begin_salvage(error)
         if self._salvage is None:
-            return FileContent({}, ())
+            return FileContent({}, None)
         found = self._salvage.times
         return FileContent({key: (count, 0) for key, count in self._salvage.counts.items()},
-                           (min(found), max(found)) if found else ())
+                           (min(found), max(found)) if found else None)
 
     def messages(self, topics: Collection[str] | None, start: int | None,
                  stop: int | None) -> Iterator[Found]:
@@ -137,7 +138,7 @@ class StoredFile:
                     stop: int | None) -> Iterator[Found]:
         with self._library() as reader:
             is_ros1 = isinstance(reader, Ros1Reader)
-            types = types_of(((c.msgtype, c.msgdef) for c in reader.connections), is_ros1)
+            types = types_of(tuple((c.msgtype, c.msgdef) for c in reader.connections), is_ros1)
             connections = [c for c in reader.connections if topics is None or c.topic in topics]
             missing = sum(c.msgcount for c in connections)
             # For the library an empty list means all connections.

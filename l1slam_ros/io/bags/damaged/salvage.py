@@ -97,8 +97,8 @@ class Salvage:
 
     def types(self) -> Any:
         """Return the types for decoding."""
-        return types_of((name, MessageDefinition(MessageDefinitionFormat.MSG, text))
-                        for name, text in self._definitions.items())
+        return types_of(tuple((name, MessageDefinition(MessageDefinitionFormat.MSG, text))
+                              for name, text in self._definitions.items()))
 
     def _walk(self) -> Iterator[BagMessage]:
         """Yield the messages in the order in which they were written."""
