@@ -58,15 +58,19 @@ def recording_of(bag):
         return [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
 
 
-def write_mcap(stream, recording, ends=None, **options):
-    """Write with the mcap library; `ends` gets where the file ends after each message."""
+def write_mcap(stream, recording, ends=None, defined=True, **options):
+    """
+    Write with the mcap library.
+
+    ends : gets where the file ends after each message; defined : whether definitions are written
+    """
     writer = McapWriter(stream, **options)
     writer.start('ros2', 'test')
     channels = {}
     for topic, msgtype, time, data in recording:
         if topic not in channels:
             text, _ = TYPES.generate_msgdef(msgtype, ros_version=2)
-            schema = writer.register_schema(msgtype, 'ros2msg', text.encode())
+            schema = writer.register_schema(msgtype, 'ros2msg', text.encode() * defined)
             channels[topic] = writer.register_channel(topic, 'cdr', schema)
         writer.add_message(channels[topic], time, data, time)
         if ends is not None:
@@ -96,12 +100,18 @@ def rosbag2_directory(path, recording, plugin, mode=CompressionMode.NONE, note=N
 
 def split_directory(path, recording, plugin, mode=CompressionMode.NONE, parts=3):
     """Write several files as rosbag2 does when it splits: `bag_0`, `bag_1` and so on."""
-    path.mkdir()
     size = -(-len(recording) // parts)
+    return directory_of(path, [recording[k * size:(k + 1) * size] for k in range(parts)], plugin,
+                        mode)
+
+
+def directory_of(path, pieces, plugin, mode=CompressionMode.NONE, order=lambda names: names):
+    """Write a file for each piece of a recording; order : that in which they are listed."""
+    path.mkdir()
     names, totals = [], None
-    for k in range(parts):
+    for k, piece in enumerate(pieces):
         part = path / f'{path.name}_{k}'
-        rosbag2_directory(part, recording[k * size:(k + 1) * size], plugin, mode)
+        rosbag2_directory(part, piece, plugin, mode)
         document = yaml.safe_load((part / 'metadata.yaml').read_text())
         metadata = document['rosbag2_bagfile_information']
         names += metadata['relative_file_paths']
@@ -113,7 +123,7 @@ def split_directory(path, recording, plugin, mode=CompressionMode.NONE, parts=3)
         known = totals['rosbag2_bagfile_information']['topics_with_message_count']
         known += [t for name, t in topics.items()
                   if name not in {k['topic_metadata']['name'] for k in known}]
-    totals['rosbag2_bagfile_information']['relative_file_paths'] = names
+    totals['rosbag2_bagfile_information']['relative_file_paths'] = order(names)
     (path / 'metadata.yaml').write_text(yaml.safe_dump(totals))
     return path
 

@@ -74,8 +74,13 @@ def _print_rows(rows: list[tuple[str, str]]) -> None:
     print('\n'.join(f'{name:<12}{value}' for name, value in rows))
 
 
-def read(arguments: argparse.Namespace, path: Path, quiet: bool = False) -> GraphRecord:
-    """Return the graph of an input, as the options for bags say; warn of what was skipped."""
+def read(arguments: argparse.Namespace, path: Path, quiet: bool = False,
+         more: Sequence[Path] = ()) -> GraphRecord:
+    """
+    Return the graph of an input, as the options for bags say; warn of what was skipped.
+
+    more : further bags of the drive whose first bag is the input
+    """
     options = None
     if arguments.params_file:
         from l1slam_ros.io.node_options import read_params_file
@@ -85,11 +90,16 @@ def read(arguments: argparse.Namespace, path: Path, quiet: bool = False) -> Grap
         record = read_scan_map(arguments, path, quiet).record
         warn(record.skipped, quiet)
         return record
-    topics = Topics(arguments.odom_topic, arguments.loop_topic, with_loops=False)
-    record = formats.read_input(path, options, topics, arguments.rotation_information,
-                                options.dimension if options else 2, arguments.information)
+    record = formats.read_input(
+        path, options, topics_of(arguments), arguments.rotation_information,
+        options.dimension if options else 2, arguments.information, more)
     warn(record.skipped, quiet)
     return record
+
+
+def topics_of(arguments: argparse.Namespace) -> Topics:
+    """Return the topics of a bag that the options name."""
+    return Topics(arguments.odom_topic, arguments.loop_topic, with_loops=False)
 
 
 def read_scan_map(arguments: argparse.Namespace, path: Path, quiet: bool = False,

@@ -49,7 +49,7 @@ def add_merge(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('input', type=Path, nargs='+', metavar='INPUT',
         help='two or more inputs, each of a kind that `solve` reads; an edge in one graph file '
-        'may lead to a vertex of another')
+        'may lead to a vertex of another; bags of one drive are read as one')
     add('--output', type=Path, required=True, metavar='OUT',
         help='write the map, as `solve` does: .g2o')
     add('--loops', type=Path, metavar='FILE',

@@ -12,9 +12,9 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from l1slam_ros.cli.commands import Ending, inputs, read, scan_progress
+from l1slam_ros.cli.commands import Ending, inputs, read, scan_progress, topics_of
 from l1slam_ros.cli.solving import asked_of, solved
-from l1slam_ros.core.errors import FileError, OptionError
+from l1slam_ros.core.errors import FileError, OptionError, optional_libraries
 from l1slam_ros.core.robust.batch_map import Outcome
 from l1slam_ros.fleet.merging import Merged, Part, apart_sentences, merged, parts_beside
 from l1slam_ros.fleet.rivals import rival_doubts
@@ -41,7 +41,7 @@ def merge(arguments: argparse.Namespace) -> Ending:
                    arguments.information)
 
     def settled(outcome: Outcome) -> tuple[Outcome, list[str]]:
-        return _settled(outcome, whole, paths)
+        return _settled(outcome, whole, [part.path for part in parts])
 
     # What is wrong with the whole is of no input alone.
     return solved(argparse.Namespace(**{**vars(arguments), 'input': arguments.output}),
@@ -51,18 +51,36 @@ def merge(arguments: argparse.Namespace) -> Ending:
 def _parts(arguments: argparse.Namespace, paths: list[Path]) -> tuple[list[Part], Found | None]:
     """Return all inputs, and the loops between them that the front end found, if asked to."""
     if arguments.scans is None:
-        return [_part(arguments, path) for path in paths], None
+        return [_part(arguments, drive) for drive in _drives(arguments, paths)], None
     compile_now((*SPARSE, *JUDGEMENT), arguments.quiet)
     with scan_progress(arguments.quiet) as report:
         records, found = scanned(paths, arguments.odom_topic, arguments.scans, report)
     return [Part(path, record) for path, record in zip(paths, records, strict=True)], found
 
 
-def _part(arguments: argparse.Namespace, path: Path) -> Part:
+def _drives(arguments: argparse.Namespace, paths: list[Path]) -> list[list[Path]]:
+    """Return the inputs of each drive: bags may follow each other, all else is one of its own."""
+    bags = [path for path in paths if path.exists() and formats.is_bag(path)]
+    # A file of loops counts the inputs as they are.
+    if len(bags) < _FEWEST or arguments.loops is not None:
+        return [[path] for path in paths]
+    with optional_libraries():
+        from l1slam_ros.io.bags.drives import drives
+
+    chains = drives(bags, topics_of(arguments))
+    found = {chain[0]: chain for chain in chains}
+    later = {path for chain in chains for path in chain[1:]}
+    return [found.get(path, [path]) for path in paths if path not in later]
+
+
+def _part(arguments: argparse.Namespace, drive: list[Path]) -> Part:
+    path, *more = drive
     if path.is_file() and formats.graph_reader(path) is read_graph_file:
         return Part(path, *read_one_of_several(
             path, arguments.rotation_information, arguments.information))
-    return Part(path, read(arguments, path, quiet=True))
+    record = read(arguments, path, quiet=True, more=more)
+    said = tuple(f'{other} goes on where it ends; they are read as one drive' for other in more)
+    return Part(path, replace(record, skipped=(*said, *record.skipped)))
 
 
 def _settled(outcome: Outcome, whole: Merged, paths: list[Path]) -> tuple[Outcome, list[str]]:

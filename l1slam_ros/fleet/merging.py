@@ -77,7 +77,7 @@ def merged(parts: Sequence[Part], loops: Path | None, found: Found | None = None
 
     Parameters
     ----------
-    parts : two or more
+    parts : one or more
     loops : a file of edges between them, whose vertices are `NUMBER:ID`, the number of the part,
         from 1, and the vertex in it
     found : loops that a front end found

@@ -93,7 +93,8 @@ _ORIGINS: WeakKeyDictionary[FactorGraph, _Origin] = WeakKeyDictionary()
 
 def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
                topics: Topics = DEFAULT_TOPICS, rotation_information: str = QUATERNION,
-               dimension: int = 2, information: float | None = None) -> GraphRecord:
+               dimension: int = 2, information: float | None = None,
+               more: Sequence[Path] = ()) -> GraphRecord:
     """
     Read a graph file or grow a graph from a bag.
 
@@ -108,6 +109,7 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
     dimension : of the poses of a bag (2 or 3), unless the bag notes it
     information : the entries on the diagonal of the information of factors of a graph file that
         state none; None: such a file is refused
+    more : further bags of the drive whose first bag is `path`
 
     Raises
     ------
@@ -120,7 +122,7 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
         with optional_libraries():
             from l1slam_ros.io.bags.to_graph import graph_from_bag
 
-        record = graph_from_bag(path, options, topics, dimension)
+        record = graph_from_bag(path, options, topics, dimension, more)
         return replace(record, rotation_information=rotation_information)
     read = graph_reader(path)
     if read is not None:

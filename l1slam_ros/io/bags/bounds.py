@@ -15,7 +15,7 @@ nested YAML costs a parser the square of its length. So each is bounded before i
 
 import bz2
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
@@ -29,12 +29,16 @@ from rosbags.rosbag2 import storage_mcap
 
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.io.bounded import read_yaml
+from l1slam_ros.io.files import quoted
 
 _MIB = 2**20
 # [bytes] of a chunk or a message: chunks have some megabytes, messages of cameras tens of them.
 MOST_AT_ONCE = 256 * _MIB
-# The tables of rosbag2 that are read.
-_TABLES = ('topics', 'messages', 'message_definitions', 'metadata')
+# Letters of the name of a topic or a type: ROS 2 allows 255.
+_LONGEST_NAME = 1024
+# The tables of rosbag2 that are read, and how long the statement that made one may be.
+_TABLES = ('schema', 'topics', 'messages', 'message_definitions', 'metadata')
+_LONGEST_STATEMENT = 4096
 
 
 class BombError(L1SlamError):
@@ -82,6 +86,14 @@ def _bz2(data: bytes, most: int) -> bytes:
 _UNPACK: dict[str, Callable[[bytes, int], Any]] = {'zstd': _zstd, 'lz4': _lz4, 'bz2': _bz2}
 
 
+def require_names(names: Iterable[str]) -> None:
+    """Refuse names of topics and types that are longer than any."""
+    for name in names:
+        if len(name) > _LONGEST_NAME:
+            raise BombError(f'the name {quoted(name)} of {len(name):,} characters; expected at '
+                            f'most {_LONGEST_NAME:,}')
+
+
 def require_shallow(metadata: Path) -> None:
     """Refuse a metadata.yaml that would take minutes to parse; it may be missing."""
     if not metadata.is_file():
@@ -105,11 +117,10 @@ def require_tables(database: sqlite3.Connection) -> None:
 
     """
     for name, kind, statement in database.execute(
-            'SELECT name, type, sql FROM sqlite_master WHERE lower(name) IN (?, ?, ?, ?)',
-            _TABLES):
-        words = str(statement).upper()
-        plain = kind == 'table' and words.startswith('CREATE TABLE') and 'GENERATED' not in words
-        if not plain or ' AS (' in ' '.join(words.split()):
+            'SELECT name, type, sql FROM sqlite_master WHERE lower(name) IN '
+            f'({", ".join("?" * len(_TABLES))})', _TABLES).fetchall():
+        if (kind != 'table' or not str(statement).upper().startswith('CREATE TABLE')
+                or len(str(statement)) > _LONGEST_STATEMENT or _is_computed(database, name)):
             raise BombError(f'{name} is {"a view" if kind == "view" else "computed"}; expected a '
                             'table of rosbag2')
     pages, size = (database.execute(f'PRAGMA {name}').fetchone()[0]
@@ -119,6 +130,12 @@ def require_tables(database: sqlite3.Connection) -> None:
             # This reads only the length of the blobs.
             largest, = database.execute('SELECT max(length(data)) FROM messages').fetchone()
             require_small(int(largest or 0), 'a message')
+
+
+def _is_computed(database: sqlite3.Connection, table: str) -> bool:
+    """Tell whether a table has a column that SQLite computes when it is read."""
+    columns = database.execute('SELECT hidden FROM pragma_table_xinfo(?)', (table,))
+    return any(hidden for hidden, in columns)
 
 
 def _bound_library() -> None:

@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finding the topics of a bag with the pose graph of another front end, such as slam_toolbox."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,14 +32,16 @@ class Foreign:
     is_whole: bool
 
 
-def foreign_graph(path: Path, topics: Topics) -> tuple[Topics, Foreign | None]:
+def foreign_graph(paths: Sequence[Path], topics: Topics) -> tuple[Topics, Foreign | None]:
     """
     Return the topics to read, and the graph of another front end if they have one.
 
-    If a bag has no messages on the default topic of the odometry, but those of exactly one front
-    end whose messages include its odometry, that graph is read, with all its robots.
+    If the bags, all of one drive, have no messages on the default topic of the odometry, but those
+    of exactly one front end whose messages include its odometry, that graph is read, with all its
+    robots.
     """
-    types = {topic.name: topic.msgtype for topic in bag_summary(path).topics if topic.count}
+    types = {topic.name: topic.msgtype for path in paths for topic in bag_summary(path).topics
+             if topic.count}
     for name, is_whole in (topics.odometry, True), (topics.loops, False):
         front_end = front_end_of(types.get(name, ''))
         if front_end is not None:

@@ -116,7 +116,8 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
     topics[REJECTED_LOOP_TOPIC] = (np.isin(words, _REFUSED) & ~factors.is_absolute).any()
     note = _note(graph, stamps) | _turned_note(graph, backward) | _left_out_note(graph, words)
     in_order = iter(words[loops_of(graph)].tolist())
-    with new_bag(path, note) as writer:
+    # A simulated drive is recorded as a real one is: no two messages at one time.
+    with new_bag(path, note, apart=truth is not None) as writer:
         writer.add_topic(ODOMETRY_TOPIC, _ODOMETRY)
         for topic in sorted(topic for topic, used in topics.items() if used):
             writer.add_topic(topic, _LOOP)

@@ -9,45 +9,40 @@
 """
 Reading bags: rosbag2 directories, bare `.mcap` and `.db3` files, `.bag` files of ROS 1.
 
-The bag library reads them; if it fails, `salvage` reads what is before the damage. The libraries
+The files of a bag are read together, by time: recorders write late messages, and begin anew. Of a
+damaged file what is before the damage is used, and of the other files everything. The libraries
 are slow to import, so other modules import this one only when there is a bag.
 """
 
-import math
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections import defaultdict, deque
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import islice, pairwise
+from math import inf
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
-
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import QosDurability
-from rosbags.typesys import Stores, get_typestore
+from typing import Any, NamedTuple
 
 from l1slam_ros.core.errors import FileError, L1SlamError
-from l1slam_ros.io.bags.bounds import BombError, require_shallow, require_tables
-from l1slam_ros.io.bags.damaged.salvage import (
+from l1slam_ros.io.bags.bag_files import (
     METADATA,
-    Salvage,
-    bag_names,
-    complaint,
+    bag_count,
     directory_metadata,
+    files_of,
     storage_files,
 )
+from l1slam_ros.io.bags.bounds import BombError, require_shallow
 from l1slam_ros.io.bags.damaged.walk import BagMessage
-from l1slam_ros.io.bags.damaged.walk_mcap import is_indexed, mcap_metadata
-from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, is_cut, opened, sqlite_metadata
+from l1slam_ros.io.bags.damaged.walk_mcap import mcap_metadata
+from l1slam_ros.io.bags.damaged.walk_sqlite import sqlite_metadata
+from l1slam_ros.io.bags.stored_file import Found, StoredFile
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES
 from l1slam_ros.io.bags.writer import NOTE_KEY
 from l1slam_ros.io.bounded import read_yaml
 from l1slam_ros.io.files import other_kind
 
-# Types that ROS 1 messages contain, in their ROS 2 form.
-_BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
-_TO_ITS_END = 'expected a bag that can be read to its end'
-# Called with one sentence about the damage, after everything before it was read.
+# Called with one sentence about the damage, after everything that can be read was.
 OnDamage = Callable[[str], None]
 
 
@@ -84,15 +79,17 @@ class BagSummary:
 
 
 def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None,
-                  on_damage: OnDamage = _refuse) -> Iterator[BagMessage]:
+                  on_damage: OnDamage = _refuse, more: Sequence[Path] = ()
+                  ) -> Iterator[BagMessage]:
     """
     Yield the messages of a bag in order of time, decoded.
 
     Parameters
     ----------
-    path : a rosbag2 directory, .mcap, .db3 or .bag
+    path : a rosbag2 directory, .mcap, .db3, .bag, or a directory with the files of one bag
     topics : only these, as far as the bag has them; None: all
     on_damage : called in the end with the reason why only a part could be read; by default raises
+    more : further bags of the same drive, read together with it
 
     Raises
     ------
@@ -100,7 +97,7 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
 
     """
     count = undecodable = 0
-    for raw, types in _messages(path, topics, None, None, on_damage):
+    for raw, types in _messages((path, *more), topics, None, None, on_damage):
         try:
             message = types.deserialize_cdr(raw.data, raw.msgtype)
         except Exception:  # malformed messages make the library raise any error
@@ -121,7 +118,7 @@ def read_raw(path: str | os.PathLike[str], topics: Collection[str] | None = None
 
     start, stop : only messages from start [ns] on and before stop [ns].
     """
-    for message, _ in _messages(path, topics, start, stop, on_damage):
+    for message, _ in _messages((path,), topics, start, stop, on_damage):
         yield message
 
 
@@ -135,30 +132,23 @@ def bag_summary(path: str | os.PathLike[str]) -> BagSummary:
 
     """
     bag = _bag_path(path)
-    try:
-        with _reader(bag) as reader:
-            counts = [(name, topic.msgtype or 'several types', topic.msgcount, _kept(topic))
-                      for name, topic in reader.topics.items()]
-            # Without messages the library's times are its largest and smallest numbers; its end
-            # lies one nanosecond behind the last message.
-            times = [reader.start_time, reader.end_time - 1] if reader.message_count else [0]
-    except Exception as error:  # damaged bags make the library raise anything
-        salvage = _salvage(bag, error)
-        counts = [(*names, count, 0) for names, count in salvage.counts.items()]
-        times = salvage.times
-    topics = tuple(TopicSummary(*entry) for entry in sorted(counts))
-    return BagSummary(topics, min(times), max(times) - min(times), read_note(path))
-
-
-def _kept(topic: Any) -> int:
-    """Return how many messages of a topic were kept for subscribers that come late."""
-    kept = 0
-    for connection in topic.connections:
-        for profile in getattr(connection.ext, 'offered_qos_profiles', ()):
-            if profile.durability is QosDurability.TRANSIENT_LOCAL:
-                kept += max(profile.depth, 1)
-        kept += bool(getattr(connection.ext, 'latching', False))  # of ROS 1
-    return kept
+    files, listing = _stored_files(bag)
+    types = defaultdict[str, set[str]](set)
+    counts = defaultdict[str, int](int)
+    kept = defaultdict[str, int](int)
+    times = list[int]()
+    for file in files:
+        content = file.content()
+        times += content.times or ()
+        for (name, msgtype), (count, late) in content.counts.items():
+            types[name].add(msgtype)
+            counts[name] += count
+            kept[name] = max(kept[name], late)
+    _require_any(bag, files, listing)
+    topics = tuple(TopicSummary(name, (*found, 'several types')[0 if len(found) == 1 else -1],
+                                counts[name], kept[name]) for name, found in sorted(types.items()))
+    start = min(times, default=0)
+    return BagSummary(topics, start, max(times, default=start) - start, read_note(path))
 
 
 def read_note(path: str | os.PathLike[str]) -> dict[str, str]:
@@ -204,103 +194,98 @@ def _bag_path(path: str | os.PathLike[str]) -> Path:
     bag = Path(path)
     if not bag.exists():
         raise FileError(path, 'no such file or directory; expected a bag')
-    if bag.is_file() and bag.suffix.lower() not in BAG_SUFFIXES:
+    if not bag.is_dir() and bag.suffix.lower() not in BAG_SUFFIXES:
         raise FileError(path, f'does not have the name of a bag; expected '
                         f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')
-    if bag.is_dir() and not (bag / METADATA).is_file() and len(bag_names(bag)) != 1:
+    if bag.is_dir() and not (bag / METADATA).is_file() and (count := bag_count(bag)) != 1:
         raise FileError(path, f'a directory without {METADATA} and with the files of '
-                        f'{len(bag_names(bag))} bags; expected a rosbag2 directory')
-    for part in bag.iterdir() if bag.is_dir() else (bag, bag.with_name(f'{bag.name}-wal')):
-        if kind := '' if part.is_dir() else other_kind(part):  # reading it may never end
+                        f'{count} bags; expected a rosbag2 directory')
+    for part in () if bag.is_dir() else (bag, bag.with_name(f'{bag.name}-wal')):
+        if kind := other_kind(part):  # reading it may never end
             raise FileError(part, f'cannot be read: it is {kind}')
     return bag
 
 
-def _messages(path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
-              stop: int | None, on_damage: OnDamage) -> Iterator[tuple[BagMessage, Any]]:
-    """Yield the messages of a bag, each with the types for decoding it."""
-    bag = _bag_path(path)
-    count = 0
-    last = -math.inf
+def _stored_files(bag: Path) -> tuple[list[StoredFile], str]:
+    """Return the files of a bag, and what is wrong with their list, empty if nothing is."""
     try:
-        # All messages of one time or none: the library may order them differently from the file.
-        for time, group in groupby(_by_library(bag, topics, start, stop), lambda m: m[0].time):
-            messages = list(group)
-            count = count + len(messages)
-            last = time
-            yield from messages
-        return
-    except Exception as error:  # damaged bags make the library raise anything
-        salvage = _salvage(bag, error)
-    types = salvage.types()
-    for message in salvage.messages(topics, start, stop):
-        if message.time > last:
-            count += 1
-            yield message, types
-    if salvage.damage is not None:
-        on_damage(salvage.damage.sentence(count))
-
-
-def _by_library(bag: Path, topics: Collection[str] | None, start: int | None,
-                stop: int | None) -> Iterator[tuple[BagMessage, Any]]:
-    with _reader(bag) as reader:
-        types = reader.typestore if reader.is2 else _ros1_types(reader.typestore.fielddefs)
-        connections = [c for c in reader.connections if topics is None or c.topic in topics]
-        missing = sum(c.msgcount for c in connections)
-        # For the library an empty list means all connections.
-        for c, time, data in reader.messages(connections, start, stop) if connections else ():
-            missing -= 1
-            cdr = bytes(data if reader.is2 else types.ros1_to_cdr(data, c.msgtype))
-            yield BagMessage(c.topic, c.msgtype, time, cdr), types
-        # The library stops silently at a damaged record within a chunk.
-        if missing > 0 and start is None and stop is None:
-            raise LookupError(f'{missing:,} messages are missing')
-
-
-def _ros1_types(fields: Mapping[str, Any]) -> Any:
-    """Return the types for converting messages of ROS 1 to CDR and decoding them."""
-    jazzy = get_typestore(Stores.ROS2_JAZZY).fielddefs
-    types = get_typestore(Stores.EMPTY)
-    # The header of ROS 1 has one more field, which the library's conversion drops.
-    types.register({**fields, **{name: jazzy[name] for name in _BASIC}})
-    return types
-
-
-@contextmanager
-def _reader(bag: Path) -> Iterator[Any]:
-    """Yield the library's reader of a bag, after checks that the library does not make."""
-    if bag.is_dir():
         require_shallow(bag / METADATA)
-        if str(directory_metadata(bag).get('compression_mode') or 'none').lower() != 'none':
-            raise LookupError('compressed by file or message')  # the library does not limit that
-    for file in storage_files(bag) if bag.is_dir() else [bag]:
-        if file.suffix == '.mcap' and not is_indexed(file):
-            raise LookupError(f'{file.name} has no sound index')
-        if file.suffix == '.db3' and (has_journal(file) or is_cut(file)):
-            raise LookupError(f'{file.name} is not all there')
-        if file.suffix == '.db3':
-            with opened(file) as database:
-                require_tables(database)
-    # Used if the bag has no definitions, as sqlite bags of older distributions.
-    typestore = get_typestore(Stores.ROS2_JAZZY)
-    with AnyReader([bag], default_typestore=typestore) as reader:
-        yield reader
-
-
-def _salvage(bag: Path, error: Exception) -> Salvage:
-    """Return the messages before the damage of a bag that the library cannot read."""
-    if isinstance(error, BombError):
+    except BombError as error:
         raise FileError(bag, str(error)) from error
-    if bag.suffix.lower() == '.bag':
-        raise FileError(bag, f'damaged, or not a bag ({complaint(error)}); {_TO_ITS_END}: '
-                        '`rosbag reindex` may repair it') from error
-    try:
-        salvage = Salvage(bag)
-    except BombError as bomb:
-        raise FileError(bag, str(bomb)) from bomb
-    if salvage.counts:
-        return salvage
-    reason = complaint(error)
-    if salvage.damage is not None and salvage.damage.where.startswith(': '):
-        reason = salvage.damage.where[2:]
-    raise FileError(bag, f'damaged, or not a bag ({reason}); {_TO_ITS_END}') from error
+    files, listing = files_of(bag)
+    return [StoredFile(file) for file in files], listing
+
+
+def _require_any(bag: Path, files: Sequence[StoredFile], listing: str) -> None:
+    """Refuse a bag if nothing in any of its files could be read."""
+    if all(file.failure for file in files):
+        reason = next((file.failure for file in files), listing)
+        raise FileError(bag, f'damaged, or not a bag ({reason}); expected a bag that can be read '
+                        'to its end')
+
+
+def _messages(paths: Sequence[str | os.PathLike[str]], topics: Collection[str] | None,
+              start: int | None, stop: int | None, on_damage: OnDamage) -> Iterator[Found]:
+    """Yield the messages of bags of one drive, each with the types for decoding it."""
+    bags = [_bag_path(path) for path in paths]
+    stored = [_stored_files(bag) for bag in bags]
+    count = 0
+    for found in _by_time([file for files, _ in stored for file in files], topics, start, stop):
+        count += 1
+        yield found
+    several = sum(len(files) for files, _ in stored) > 1
+    for bag, (files, listing) in zip(bags, stored, strict=True):
+        _require_any(bag, files, listing)
+        damages = [str(file.damage) for file in files if file.damage]
+        if damages:
+            others = f' (and {len(damages) - 1:,} more of its files)' if len(damages) > 1 else ''
+            on_damage(f'{damages[0]}{others}; {count:,} messages before '
+                      f'{"and after " if several else ""}that were used')
+        elif listing:
+            on_damage(f'{bag} is damaged: {listing}; {count:,} messages of its files were used')
+
+
+def _by_time(files: Sequence[StoredFile], topics: Collection[str] | None, start: int | None,
+             stop: int | None) -> Iterator[Found]:
+    """
+    Yield the messages of all files in order of time.
+
+    Of each file one is held in memory, and nothing of a file before its time. Of one time in
+    several files nothing says which came first, unless one ends where the next begins: they come
+    by topic and content, so that it does not matter how a bag was split.
+    """
+    if len(files) == 1:
+        yield from files[0].messages(topics, start, stop)
+        return
+    begun = [(*times, file) for file in files if (times := file.content().times)]
+    waiting = deque(sorted(begun, key=itemgetter(0, 1)))
+    ahead = list[_Ahead]()
+    while waiting or ahead:
+        time = min((one.found[0].time for one in ahead), default=inf)
+        if waiting and waiting[0][0] <= time:
+            begin, end, file = waiting.popleft()
+            messages = file.messages(topics, start, stop)
+            ahead += [_Ahead(begin, end, messages, found) for found in islice(messages, 1)]
+            continue
+        now = sorted((one for one in ahead if one.found[0].time == time), key=itemgetter(0, 1))
+        ahead = [one for one in ahead if one.found[0].time > time]
+        tied = list[Found]()
+        for one in now:
+            tied.append(one.found)
+            for following in one.messages:
+                if following[0].time > time:
+                    ahead.append(one._replace(found=following))
+                    break
+                tied.append(following)
+        if any(one.end > other.begin for one, other in pairwise(now)):
+            tied.sort(key=lambda one: (one[0].topic, one[0].data))
+        yield from tied
+
+
+class _Ahead(NamedTuple):
+    """A file that is being read: its first and last time [ns], and its next message."""
+
+    begin: int
+    end: int
+    messages: Iterator[Found]
+    found: Found

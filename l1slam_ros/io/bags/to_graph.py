@@ -16,6 +16,7 @@ This module also reads true poses from a topic.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from l1slam_ros.core.online.keyframes import (
     OdometryOptions,
 )
 from l1slam_ros.core.online.options import GraphBuilderOptions
+from l1slam_ros.io.bags.bag_files import files_of
 from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.foreign_topics import Foreign, foreign_graph
 from l1slam_ros.io.bags.from_graph import (
@@ -69,7 +71,7 @@ _POSES = ('geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovariance
 
 
 def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topics,
-                   dimension: int = 2) -> GraphRecord:
+                   dimension: int = 2, more: Sequence[Path] = ()) -> GraphRecord:
     """
     Build a graph from the messages of a bag, damaged or not.
 
@@ -80,6 +82,7 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
         values that are defaults
     topics : of the odometry and the loops
     dimension : of the poses, 2 or 3; a note in the bag that says 3 comes first
+    more : further bags of the same drive, see `drives`; errors name the first bag
 
     Raises
     ------
@@ -89,15 +92,17 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
     note = read_note(path)
     in_space = dimension == 3 or note.get('dimension') == SPACE_NOTE['dimension']
     options = _noted_options(options or GraphBuilderOptions(), note)
-    topics, foreign = foreign_graph(path, topics)
+    topics, foreign = foreign_graph((path, *more), topics)
     growing = _Growing(se3 if in_space else se2, options, topics, foreign,
                        note.get('messages') == VERBATIM_NOTE['messages'])
     damage: list[str] = []
     read = topics.types() | (foreign.topics if foreign else {})
-    for message in read_messages(path, read, damage.append):
+    for message in read_messages(path, read, damage.append, more):
         growing.take(message)
     record = growing.record('; '.join(damage))
-    if options.keyframe == _EVERY:
+    # The note counts messages. Of several files a damaged one leaves a gap, and the count is off.
+    counted_all = not damage or not more and len(files_of(path)[0]) == 1
+    if options.keyframe == _EVERY and counted_all:
         record = replace(record, graph=turned(record.graph, _noted_turns(record.graph, note)),
                          left_out=_noted_left_out(record.graph, note))
     if record.graph.n_poses < 2:

@@ -25,7 +25,7 @@ import yaml
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from l1slam_ros.io.bags.damaged.salvage import METADATA
+from l1slam_ros.io.bags.bag_files import METADATA
 from l1slam_ros.io.files import dated_names, new_folder_beside, reported, sync_folder
 
 NOTE_KEY = 'l1slam'
@@ -43,10 +43,10 @@ _QOS = {'history': 'keep_last', 'depth': 1000, 'reliability': 'reliable', 'durab
 
 
 class BagWriter:
-    """Writes serialised messages into a new bag."""
+    """Writes serialised messages into a new bag; apart : see `new_bag`."""
 
-    def __init__(self, writer: Any, typestore: Any):
-        self._writer, self._typestore = writer, typestore
+    def __init__(self, writer: Any, typestore: Any, apart: bool):
+        self._writer, self._typestore, self._apart = writer, typestore, apart
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._msgtypes: dict[str, str] = {}
@@ -67,6 +67,8 @@ class BagWriter:
 
     def write(self, topic: str, time: int, data: bytes) -> None:
         """Write a message (CDR) at a time [ns]."""
+        if self._apart:
+            time = max(time, self._times[1] + 1)
         self._writer.add_message(self._channels[topic], time, data, time)
         self._counts[topic] += 1
         self._times = (min(self._times[0], time), max(self._times[1], time))
@@ -93,7 +95,8 @@ class BagWriter:
 
 
 @contextmanager
-def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagWriter]:
+def new_bag(path: str | os.PathLike[str], note: dict[str, str],
+            apart: bool = False) -> Iterator[BagWriter]:
     """
     Yield the writer of a new bag, which is put in place when the block succeeds.
 
@@ -102,6 +105,7 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
     path : a bag already there is replaced once the new one is complete; anything else that is
         there is kept beside it, under its name and the time of its last change
     note : what `read_note` will return
+    apart : whether a message is written behind the one before, at the least by a nanosecond
 
     Raises
     ------
@@ -118,7 +122,7 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
             # The note comes first, so that it is not lost if the file is cut.
             if note:
                 writer.add_metadata(NOTE_KEY, note)
-            bag = BagWriter(writer, get_typestore(Stores.ROS2_JAZZY))
+            bag = BagWriter(writer, get_typestore(Stores.ROS2_JAZZY), apart)
             yield bag
             metadata = bag.metadata(file.name, note)
             writer.add_metadata('rosbag2', {'serialized_metadata': _yaml(metadata)})

@@ -260,15 +260,24 @@ def checked_pose3(t: Any, q: Any) -> Array:
 def _ends(message: Any, base_frame: str, ordered: bool) -> tuple[int, int]:
     """Return reference and stamp of a loop [ns]."""
     stamp = stamp_of(message.header)
-    reference = _reference_stamp(message.header.frame_id, base_frame)
+    reference = reference_stamp(message.header.frame_id, base_frame)
     if ordered and reference >= stamp:
         raise MessageError('order', f'reference {stamp_text(reference)} of a loop; '
                            f'expected one earlier than its stamp {stamp_text(stamp)}')
     return reference, stamp
 
 
-def _reference_stamp(frame_id: str, base_frame: str) -> int:
-    """Return the stamp [ns] that a reference frame names."""
+def reference_stamp(frame_id: str, base_frame: str) -> int:
+    """
+    Return the stamp [ns] that a reference frame names.
+
+    base_frame : the robot's; empty: any
+
+    Raises
+    ------
+    MessageError : it names none, or another frame.
+
+    """
     match = _REFERENCE_FRAME.fullmatch(frame_id)
     expected = f'{base_frame or "<base_frame>"}@<sec>.<nanosec, 9 digits>'
     if match is None or (

@@ -18,7 +18,8 @@ from contextlib import closing
 import lz4.frame
 import pytest
 import zstandard
-from mcap.writer import CompressionType, Writer
+from command import run
+from mcap.writer import CompressionType, IndexType, Writer
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.bags.bounds import MOST_AT_ONCE
@@ -112,6 +113,49 @@ def test_a_column_that_is_computed_is_refused(tmp_path):
               'data AS (zeroblob(900000000)))', 'INSERT INTO messages VALUES (1, 1, 1)')
     with pytest.raises(FileError, match='messages is computed'):
         list(read_messages(bag))
+
+
+@pytest.mark.parametrize('column', [
+    'data BLOB AS(zeroblob(900000000))', 'data BLOB AS\t(zeroblob(900000000)) STORED',
+    '"data" BLOB GENERATED ALWAYS AS(zeroblob(900000000)) VIRTUAL'])
+def test_a_column_is_computed_however_that_is_spelled(tmp_path, capsys, column):
+    bag = tmp_path / 'bomb.db3'
+    # A stored one is computed here; it is small, as only its kind counts.
+    column = column.replace('900000000', '9') if 'STORED' in column else column
+    _database(bag, 'CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, '
+              f'{column})',
+              *(f'INSERT INTO messages VALUES ({k}, 1, {k})' for k in range(1, 30)))
+    began = time.process_time()
+    assert 'messages is computed' in run(capsys, 'info', bag, code=2)[1]
+    assert time.process_time() - began < 2
+
+
+def test_a_view_in_the_place_of_the_schema_is_refused(tmp_path, capsys):
+    bag = tmp_path / 'bomb.db3'
+    _database(bag, 'CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data)',
+              'CREATE VIEW schema AS WITH RECURSIVE more(id) AS (SELECT 1 UNION ALL SELECT id + 1 '
+              'FROM more) SELECT max(id) AS schema_version FROM more')
+    assert 'schema is a view' in run(capsys, 'info', bag, code=2)[1]
+
+
+@pytest.mark.parametrize('indexed', [True, False])
+def test_the_name_of_a_topic_has_an_end(tmp_path, capsys, indexed):
+    mcap, sqlite = tmp_path / 'bomb.mcap', tmp_path / 'bomb.db3'
+    index = {} if indexed else {'index_types': IndexType.NONE, 'use_statistics': False,
+                                'repeat_channels': False, 'use_summary_offsets': False}
+    with mcap.open('wb') as stream:
+        writer = Writer(stream, compression=CompressionType.ZSTD, **index)
+        writer.start('ros2')
+        channel = writer.register_channel('/a' * 10**6, 'cdr', writer.register_schema(
+            _ODOM[1], 'ros2msg', b''))
+        writer.add_message(channel, 1, b'', 1)
+        writer.finish()
+    _database(sqlite, 'CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data)',
+              "UPDATE topics SET name = '/' || hex(zeroblob(1000000))",
+              "INSERT INTO messages VALUES (1, 1, 1, x'00')")
+    for bag in mcap, sqlite:
+        said = run(capsys, 'info', bag, code=2)[1]
+        assert 'characters; expected at most 1,024' in said and len(said) < 500
 
 
 def test_a_blob_of_gigabytes_is_refused(tmp_path):

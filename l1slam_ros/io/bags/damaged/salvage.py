@@ -7,14 +7,11 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Reading the messages before the first damage of a bag that the bag library refuses.
+Reading the messages before the first damage of a file that the bag library refuses.
 
-The files of a bag are walked in the order in which they were written, up to the first damage.
-Messages behind it are not used: odometry that ends early gives a smaller map, odometry with a gap
-a wrong one.
+The file is walked in the order in which it was written; what is behind the damage is not used.
 """
 
-import re
 from collections import Counter, deque
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
@@ -24,17 +21,14 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import zstandard  # comes with the bag libraries
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from l1slam_ros.io.bags.bounds import MOST_AT_ONCE, BombError, unpacked
 from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 from l1slam_ros.io.bags.damaged.walk_mcap import walk_mcap
 from l1slam_ros.io.bags.damaged.walk_sqlite import walk_sqlite
-from l1slam_ros.io.bounded import read_yaml
+from l1slam_ros.io.bags.definitions import types_of
 
-METADATA = 'metadata.yaml'
-# How rosbag2 names the files of a bag; `.zstd` if whole files are compressed.
-_STORAGE_NAME = re.compile(r'(?P<bag>.+?)(_[0-9]+)?(\.mcap|\.db3)(\.zstd)?')
 # The first bytes of a message that rosbag2 compressed alone; CDR never begins like this.
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 _WALKS = {'.mcap': walk_mcap, '.db3': walk_sqlite}
@@ -44,28 +38,20 @@ _COMPLAINT = 200  # largest number of characters of a library's error that are q
 
 
 class DamageError(Exception):
-    """
-    Why a bag cannot be read to its end.
+    """Why a file cannot be read to its end; where : the words after 'damaged'."""
 
-    where : the words after 'damaged'; used : which messages are used
-    """
-
-    def __init__(self, path: Path, where: str, used: str = 'before that'):
+    def __init__(self, path: Path, where: str):
         super().__init__(f'{path} is damaged{where}')
-        self.where, self.used = where, used
-
-    def sentence(self, count: int) -> str:
-        """Return the damage as one sentence; count : how many messages were used."""
-        return f'{self}; {count:,} messages {self.used} were used'
+        self.where = where
 
 
 class Salvage:
     """
-    A damaged bag; the constructor reads through it once.
+    A damaged file; the constructor reads through it once.
 
     Parameters
     ----------
-    bag : a rosbag2 directory, .mcap or .db3
+    file : .mcap or .db3, or one of them packed as a whole (.zstd)
 
     Attributes
     ----------
@@ -75,8 +61,8 @@ class Salvage:
 
     """
 
-    def __init__(self, bag: Path):
-        self._bag = bag
+    def __init__(self, file: Path):
+        self._file = file
         self._definitions: dict[str, str] = {}
         self.counts: Counter[tuple[str, str]] = Counter()
         self.times: list[int] = []
@@ -91,9 +77,9 @@ class Salvage:
     def messages(self, topics: Collection[str] | None, start: int | None,
                  stop: int | None) -> Iterator[BagMessage]:
         """
-        Yield the messages in order of time; equal times in the order of the files.
+        Yield the messages in order of time; equal times in the order of the file.
 
-        The bag is read once more, so that only messages that are ahead of time are held in memory.
+        The file is read once more, so that only messages ahead of time are held in memory.
 
         topics : only these; None: all; start, stop : only from start [ns] on and before stop [ns]
         """
@@ -110,81 +96,31 @@ class Salvage:
                     yield due
 
     def types(self) -> Any:
-        """Return the types for decoding: those of Jazzy, and others as the bag defines them."""
-        types = get_typestore(Stores.ROS2_JAZZY)
-        for name, text in self._definitions.items():
-            with suppress(Exception):  # a damaged definition makes the library raise anything
-                types.register({other: fields for other, fields
-                                in get_types_from_msg(text, name).items()
-                                if other not in types.fielddefs})
-        return types
+        """Return the types for decoding."""
+        return types_of(tuple((name, MessageDefinition(MessageDefinitionFormat.MSG, text))
+                              for name, text in self._definitions.items()))
 
     def _walk(self) -> Iterator[BagMessage]:
-        """Yield the messages of all files in the order in which they were written."""
-        files, damage = _files(self._bag)
-        for file in files:
-            if not file.exists():
-                raise DamageError(file, ': the file is missing')
-            try:
-                yield from self._messages_of(file)
-            except (DamageError, BombError):
-                raise
-            except Exception as error:  # damaged files make the libraries raise anything
-                raise DamageError(file, f': {complaint(error)}') from error
-        if damage is not None:
-            raise damage
-
-    def _messages_of(self, file: Path) -> Iterator[BagMessage]:
-        with _decompressed(file) as readable:
-            walk = _WALKS[readable.suffix.lower()]
-            try:
-                yield from map(_unpacked, walk(readable, self._definitions))
-            except BrokenRecordError as error:
-                size = readable.stat().st_size
-                where = (f': it breaks off after {size:,} bytes' if error.position == size
-                         else f' after {error.position:,} of {size:,} bytes')
-                raise DamageError(file, where) from error
+        """Yield the messages in the order in which they were written."""
+        try:
+            with _decompressed(self._file) as readable:
+                walk = _WALKS[readable.suffix.lower()]
+                try:
+                    yield from map(unpacked_alone, walk(readable, self._definitions))
+                except BrokenRecordError as error:
+                    size = readable.stat().st_size
+                    where = (f': it breaks off after {size:,} bytes' if error.position == size
+                             else f' after {error.position:,} of {size:,} bytes')
+                    raise DamageError(self._file, where) from error
+        except (DamageError, BombError):
+            raise
+        except Exception as error:  # damaged files make the libraries raise anything
+            raise DamageError(self._file, f': {complaint(error)}') from error
 
 
 def complaint(error: Exception) -> str:
     """Return the message of a library's error on one line."""
     return ' '.join(str(error).split())[:_COMPLAINT] or type(error).__name__
-
-
-def directory_metadata(bag: Path) -> dict[str, Any]:
-    """Return the content of the metadata.yaml of a bag; empty if it cannot be read."""
-    with suppress(Exception):  # it may be missing, or not text, or not such YAML
-        document = read_yaml((bag / METADATA).read_text(encoding='utf-8'))
-        return dict(document['rosbag2_bagfile_information'])
-    return {}
-
-
-def storage_files(directory: Path) -> list[Path]:
-    """Return the existing files of a bag in the order of their numbers."""
-    def by_number(path: Path) -> list[tuple[str, int]]:
-        return [(text, int(number or 0)) for text, number
-                in re.findall(r'(\D*)([0-9]*)', path.name)]
-
-    return sorted((path for path in directory.iterdir() if _STORAGE_NAME.fullmatch(path.name)),
-                  key=by_number)
-
-
-def bag_names(directory: Path) -> set[str]:
-    """Return the names, without numbers, of the bags whose files are in a directory."""
-    matches = map(_STORAGE_NAME.fullmatch, (path.name for path in directory.iterdir()))
-    return {match['bag'] for match in matches if match}
-
-
-def _files(bag: Path) -> tuple[list[Path], DamageError | None]:
-    """Return the files of a bag in the order of writing, and an error if their list is damaged."""
-    if not bag.is_dir():
-        return [bag], None
-    names = directory_metadata(bag).get('relative_file_paths')
-    if isinstance(names, list) and names and all(isinstance(name, str) for name in names):
-        # Older versions include the directory.
-        return [bag / Path(name).name for name in names], None
-    wrong = 'cannot be read' if (bag / METADATA).exists() else 'is missing'
-    return storage_files(bag), DamageError(bag, f': its {METADATA} {wrong}', 'of its files')
 
 
 @contextmanager
@@ -207,7 +143,7 @@ def _decompressed(file: Path) -> Iterator[Path]:
         yield readable
 
 
-def _unpacked(message: BagMessage) -> BagMessage:
+def unpacked_alone(message: BagMessage) -> BagMessage:
     """Return a message, decompressed if it was compressed alone."""
     if not message.data.startswith(_ZSTD_MAGIC):
         return message

@@ -25,7 +25,7 @@ from typing import Any, BinaryIO
 from mcap import data_stream, records
 from mcap.reader import make_reader
 
-from l1slam_ros.io.bags.bounds import BombError, require_small, unpacked
+from l1slam_ros.io.bags.bounds import BombError, require_names, require_small, unpacked
 from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -159,8 +159,9 @@ class _Channels:
                 self._definitions[schema.name] = schema.data.decode()
         elif opcode == _CHANNEL:
             channel = _parsed('Channel', content)
-            self._topics[channel.id] = ((channel.topic, self._schemas[channel.schema_id])
-                                        if channel.message_encoding == 'cdr' else None)
+            names = channel.topic, self._schemas[channel.schema_id]
+            require_names(names)
+            self._topics[channel.id] = names if channel.message_encoding == 'cdr' else None
 
     def chunk(self, content: bytes) -> Iterator[BagMessage]:
         """Yield the messages of a chunk; those before the damage if it is damaged."""

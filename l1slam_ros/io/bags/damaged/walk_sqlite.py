@@ -15,7 +15,7 @@ from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
 
-from l1slam_ros.io.bags.bounds import require_tables
+from l1slam_ros.io.bags.bounds import require_names, require_tables
 from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 
 _FILE_HEADER = 100  # [bytes] "Database File Format", sqlite.org/fileformat2.html
@@ -34,14 +34,16 @@ def walk_sqlite(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]
                 'SELECT topic_type, encoded_message_definition FROM message_definitions '
                 "WHERE encoding = 'ros2msg'"))
         topics = {key: (name, msgtype) for key, name, msgtype in database.execute(
-            "SELECT id, name, type FROM topics WHERE serialization_format = 'cdr'")}
+            'SELECT id, CAST(name AS TEXT), CAST(type AS TEXT) FROM topics '
+            "WHERE serialization_format = 'cdr' AND name NOT NULL AND type NOT NULL")}
+        require_names(name for names in topics.values() for name in names)
         cut = is_cut(path)
         # SQLite would read the lost part of a page as zeros.
         rows = leaf_rows(path) if cut else database.execute(
             'SELECT topic_id, CAST(timestamp AS INTEGER), CAST(data AS BLOB) FROM messages '
             'ORDER BY id')
         for key, time, data in rows:
-            if key in topics:
+            if key in topics and isinstance(time, int) and isinstance(data, bytes):
                 yield BagMessage(*topics[key], time, data)
     if cut:
         raise BrokenRecordError(path.stat().st_size)

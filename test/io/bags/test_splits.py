@@ -1,0 +1,226 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""However a recording was split, and in whichever order its files are listed: it is one bag."""
+
+import json
+import os
+import shutil
+import sqlite3
+from contextlib import closing
+
+import pytest
+from command import run
+from rosbags.rosbag2 import CompressionMode
+
+from bags import (
+    MCAP,
+    NOTE,
+    SQLITE,
+    TYPES,
+    directory_of,
+    mcap_file,
+    recording_of,
+    ros1_file,
+    rosbag2_directory,
+    write_world,
+)
+from l1slam_ros.cli.main import main
+
+POSES = 80
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp('world') / 'bag'
+    write_world(path, POSES, 120)
+    return path
+
+
+@pytest.fixture(scope='module')
+def recording(bag):
+    return recording_of(bag)
+
+
+def solved(capsys, folder, path, code=0, command=('solve',)):
+    """Return the map of a bag, what is said as JSON without the time that it took, and errors."""
+    output = folder / 'out.g2o'
+    out, err = run(capsys, *command, path, '--output', output, '--json', code=code)
+    return output.read_bytes(), {**json.loads(out), 'seconds': 0}, err
+
+
+def by_number(recording, parts):
+    size = -(-len(recording) // parts)
+    return [recording[k * size:(k + 1) * size] for k in range(parts)]
+
+
+def by_turns(recording, parts):
+    return [recording[k::parts] for k in range(parts)]
+
+
+def overlapping(recording, parts):
+    """Where one file ends and another begins, five messages of each lie between the other's."""
+    size = -(-len(recording) // parts)
+    owner = [k // size for k in range(len(recording))]
+    for border in range(size, len(recording), size):
+        for k in range(border - 5, min(border + 5, len(recording))):
+            owner[k] = border // size - k % 2
+    return [[message for message, one in zip(recording, owner, strict=True) if one == k]
+            for k in range(parts)]
+
+
+def shuffled(names):
+    return names[1::2] + names[::2][::-1]
+
+
+_KNOWN = []
+
+
+@pytest.fixture
+def plain(tmp_path, capsys, bag):
+    """Return the map of the bag, what is said of it, and what is in it."""
+    if not _KNOWN:
+        _KNOWN.append((*solved(capsys, tmp_path, bag)[:2], run(capsys, 'info', bag)[0]))
+    return _KNOWN[0]
+
+
+@pytest.mark.parametrize('plugin', [MCAP, SQLITE])
+@pytest.mark.parametrize('parts', [2, 5, 12])
+@pytest.mark.parametrize('cut', [by_number, by_turns, overlapping])
+def test_a_bag_in_parts_is_the_bag(tmp_path, capsys, plain, recording, cut, parts, plugin):
+    pieces = cut(recording, parts)
+    assert sum(map(len, pieces)) == len(recording)
+    split = directory_of(tmp_path / 'bag', pieces, plugin, order=shuffled)
+    assert (*solved(capsys, tmp_path, split)[:2], run(capsys, 'info', split)[0]) == plain
+
+
+def test_ros1_files_in_one_folder_are_one_bag(tmp_path, capsys, recording):
+    (tmp_path / 'drive').mkdir()
+    for k, piece in enumerate(by_number(recording, 3)):
+        ros1_file(tmp_path / 'drive' / f'x_2026-01-31-12-0{k}-00_{k}.bag', piece)
+    whole = ros1_file(tmp_path / 'x.bag', recording)
+    assert solved(capsys, tmp_path, tmp_path / 'drive')[:2] == solved(
+        capsys, tmp_path, whole)[:2]
+    shutil.copy(whole, tmp_path / 'drive' / 'y.bag')
+    assert 'with the files of 2 bags' in run(
+        capsys, 'info', tmp_path / 'drive', code=2)[1]
+
+
+def test_files_named_by_index_and_time_are_one_bag_without_their_list(
+        tmp_path, capsys, recording):
+    split = directory_of(tmp_path / 'bag', by_number(recording, 12), MCAP)
+    (split / 'metadata.yaml').unlink()
+    for k in range(12):
+        (split / f'bag_{k}.mcap').rename(split / f'{k}_bag_2026_01_31-12_{k:02}_30.mcap')
+    found, _, said = solved(capsys, tmp_path, split, code=3)
+    plain = rosbag2_directory(tmp_path / 'plain', recording, MCAP, note=None)
+    assert found == solved(capsys, tmp_path, plain)[0]
+    assert 'its metadata.yaml is missing' in said
+    shutil.copy(split / '0_bag_2026_01_31-12_00_30.mcap',
+                split / '0_bag_2026_02_28-12_00_30.mcap')
+    assert 'with the files of 2 bags' in run(capsys, 'info', split, code=2)[1]
+
+
+def converted(capsys, folder, path):
+    """Return how many keyframes a damaged bag gives, and what is said of it."""
+    said = run(capsys, 'convert', path, folder / 'out.g2o', code=3)[1]
+    return (folder / 'out.g2o').read_text().count('VERTEX'), said
+
+
+@pytest.mark.parametrize('plugin', [MCAP, SQLITE])
+@pytest.mark.parametrize('first', [0, 2])
+def test_what_is_before_and_after_a_damaged_file_is_used(
+        tmp_path, capsys, recording, plugin, first):
+    split = directory_of(tmp_path / 'bag', by_number(recording, 4), plugin, CompressionMode.FILE)
+    [file] = split.glob(f'bag_{first}.*')
+    file.write_bytes(file.read_bytes()[:file.stat().st_size // 3])
+    count, said = converted(capsys, tmp_path, split)
+    # Of one cut to a third a part may be used, too.
+    lost = sum(m[0] == '/odom' for m in by_number(recording, 4)[first])
+    assert POSES - lost <= count < POSES
+    [line] = [line for line in said.splitlines() if 'is damaged' in line]
+    assert f'bag_{first}.' in line and 'messages before and after that were used' in line
+
+
+def test_files_that_are_gone_are_named_in_one_line(tmp_path, capsys, recording):
+    split = directory_of(tmp_path / 'bag', by_number(recording, 6), MCAP)
+    for k in 1, 3:
+        (split / f'bag_{k}.mcap').unlink()
+    os.mkfifo(split / 'bag_3.mcap')  # nobody writes into it: who opens it waits for ever
+    count, said = converted(capsys, tmp_path, split)
+    assert count > POSES / 2
+    assert 'bag_1.mcap is damaged: the file is missing (and 1 more of its files)' in said
+
+
+def test_standard_types_need_no_definition(tmp_path, capsys, bag, recording):
+    mcap = mcap_file(tmp_path / 'a.mcap', recording, defined=False)
+    sqlite = rosbag2_directory(tmp_path / 'b', recording, SQLITE)
+    with closing(sqlite3.connect(sqlite / 'b.db3')) as database:
+        assert database.execute("UPDATE message_definitions SET encoded_message_definition = ''"
+                                ).rowcount
+        database.commit()
+    plain = rosbag2_directory(tmp_path / 'plain', recording, MCAP, note=None)
+    assert solved(capsys, tmp_path, mcap)[:2] == solved(capsys, tmp_path, plain)[:2]
+    assert solved(capsys, tmp_path, sqlite)[:2] == solved(capsys, tmp_path, bag)[:2]
+
+
+def reference(message):
+    """Return the earlier time of a loop [s]."""
+    return float(message.header.frame_id.rpartition('@')[2])
+
+
+def changed(recording, seconds=0, child=None):
+    """Return messages that came so much later, also the times among them that loops name."""
+    found, begin = [], recording[0][2] / 1e9
+    for topic, msgtype, time, data in recording:
+        message = TYPES.deserialize_cdr(data, msgtype)
+        message.header.stamp.sec += seconds
+        if topic == '/odom':
+            message.child_frame_id = child or message.child_frame_id
+        elif (earlier := reference(message)) >= begin:
+            message.header.frame_id = f'base_link@{earlier + seconds:.9f}'
+        found.append((topic, msgtype, time + seconds * 10**9,
+                      bytes(TYPES.serialize_cdr(message, msgtype))))
+    return found
+
+
+def halves(folder, recording, **change):
+    first, second = by_number(recording, 2)
+    return [rosbag2_directory(folder / name, messages, MCAP, note=NOTE) for name, messages in (
+        ('first', first), ('second', changed(second, **change)))]
+
+
+def test_bags_of_one_drive_are_merged_as_one_bag(tmp_path, capsys, bag, recording):
+    first, second = halves(tmp_path, recording)
+    for inputs in (first, second), (second, first):
+        found = solved(capsys, tmp_path, inputs[1], command=('merge', inputs[0]))
+        assert found[0] == solved(capsys, tmp_path, bag)[0]
+        assert f'{first}: {second} goes on where it ends; they are read as one drive' in found[2]
+
+
+def test_a_loop_says_after_any_pause_that_a_bag_is_of_the_drive(tmp_path, capsys, recording):
+    first, second = halves(tmp_path, recording, seconds=600)
+    found = solved(capsys, tmp_path, second, command=('merge', first))[1]
+    assert (found['poses'], found['loops'], found['parts']) == (
+        POSES, sum(m[0] == '/loop_closures' for m in recording), 1)
+
+
+@pytest.mark.parametrize('change', [
+    {'child': 'another'}, {'seconds': 24 * 3600}, {'seconds': -5}], ids=str)
+def test_bags_of_other_drives_stay_apart(tmp_path, capsys, recording, change):
+    begin = by_number(recording, 2)[1][0][2] / 1e9
+    own = [m for m in recording if m[0] == '/odom' or m[2] / 1e9 < begin or reference(
+        TYPES.deserialize_cdr(m[3], m[1])) > begin]
+    border = sum(m[2] / 1e9 < begin for m in own)
+    first, second = (rosbag2_directory(tmp_path / name, messages, MCAP, note=NOTE)
+                     for name, messages in (('first', own[:border]),
+                                            ('second', changed(own[border:], **change))))
+    main(['merge', str(first), str(second), '--output', str(tmp_path / 'out.g2o')])
+    said = capsys.readouterr().err
+    assert 'one drive' not in said
+    assert f'{second}: nothing that is believed joins it to {first}' in said
