@@ -41,7 +41,7 @@ BLIND = {f'{PACKAGE}.core.{name}': {f'{PACKAGE}.core.{other}' for other in other
          }.items()}
 # More in one folder mix responsibilities; one alone needs none.
 MODULES_OF_A_FOLDER = range(2, 13)
-LONGEST_MODULE = 350
+LONGEST_MODULE = 360
 LONGEST_FUNCTION = 60
 
 
