@@ -43,10 +43,11 @@ def generate_launch_description() -> LaunchDescription:
                         'empty: save_path and load_on_start of params_file'),
         DeclareLaunchArgument(
             'rviz', default_value='false', description='true: start RViz, too'),
-        OpaqueFunction(function=_backend),
+        # Before the node: where RViz is not installed, nothing is left running.
         Node(package='rviz2', executable='rviz2', namespace=NAMESPACE,
              arguments=['-d', [CONFIG, '/l1slam.rviz']], parameters=[SIM_TIME],
              condition=IfCondition(LaunchConfiguration('rviz'))),
+        OpaqueFunction(function=_backend),
     ])
 
 
