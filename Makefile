@@ -52,7 +52,7 @@ $(STAMP): setup.py setup.cfg pyproject.toml package.xml $(if $(wildcard $(HALF))
 
 # An editable install leaves the data files out, so they are put in place by a command of their
 # own. Setuptools warns at length about other uses of it.
-$(TESTS): $(STAMP) $(wildcard config/* resource/* resource/run/*)
+$(TESTS): $(STAMP) $(wildcard config/* launch/*.py resource/* resource/run/*)
 	$(call install,Installing what the tests need,'l1slam_ros[test]')
 	@PYTHONWARNINGS=ignore $(VENV)/bin/python setup.py --quiet install_data
 	@rm $(HALF) && touch $@

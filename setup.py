@@ -21,6 +21,7 @@ data_files = [
     ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
     (f'share/{package_name}', ['package.xml']),
     (f'share/{package_name}/config', sorted(glob('config/*'))),
+    (f'share/{package_name}/launch', sorted(glob('launch/*.py'))),
 ]
 # `ros2 run` looks in lib/<package>. colcon (it calls `install` or `develop`) puts the console
 # scripts there by setup.cfg; pip puts them in bin, so what pip installs carries starters.

@@ -33,7 +33,8 @@ HEADER = """\
 
 def files_of_python() -> list[Path]:
     """Return those of the checkout that are not empty."""
-    folders = (ROOT / name for name in ('l1slam_ros', 'test', 'benchmarks', 'config', 'doc'))
+    folders = (ROOT / name for name in ('l1slam_ros', 'test', 'benchmarks', 'config', 'doc',
+                                      'launch'))
     found = [path for folder in folders for path in sorted(folder.rglob('*.py'))]
     return [path for path in (ROOT / 'setup.py', *found) if path.stat().st_size]
 

@@ -29,7 +29,8 @@ OF_ROSDEP = {
 # by the repository that holds them; each is released as ros-jazzy-<name>.
 OF_JAZZY = {
     'builtin_interfaces': 'rcl_interfaces', 'diagnostic_msgs': 'common_interfaces',
-    'geometry_msgs': 'common_interfaces', 'lifecycle_msgs': 'rcl_interfaces',
+    'geometry_msgs': 'common_interfaces', 'launch': 'launch', 'launch_ros': 'launch_ros',
+    'lifecycle_msgs': 'rcl_interfaces',
     'nav_msgs': 'common_interfaces', 'rcl_interfaces': 'rcl_interfaces', 'rclpy': 'rclpy',
     'rosgraph_msgs': 'rcl_interfaces', 'sensor_msgs': 'common_interfaces',
     'std_msgs': 'common_interfaces', 'std_srvs': 'common_interfaces', 'tf2_msgs': 'geometry2',

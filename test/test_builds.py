@@ -137,7 +137,7 @@ def test_the_sdist_has_what_builds_the_package_and_nothing_else(distributions, s
         names = {name.partition('/')[2] for name in archive.getnames()}
     wanted = {'setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE', 'README.md',
               'resource/l1slam_ros'}
-    for folder in ('config', 'resource/run', 'l1slam_ros'):
+    for folder in ('config', 'launch', 'resource/run', 'l1slam_ros'):
         wanted |= {str(path.relative_to(source)) for path in (source / folder).rglob('*')
                    if path.is_file()}
     assert wanted <= names, wanted - names
@@ -268,7 +268,7 @@ print(l1slam_ros.__file__)
     prefix, share, module = map(Path, run(
         *sourced(workspace, python, '-c', code), cwd=tmp_path, env=lent_variables()).splitlines())
     assert prefix == workspace / 'install' / 'l1slam_ros'
-    for path in ('package.xml', 'config/backend.yaml'):
+    for path in ('package.xml', 'config/backend.yaml', 'launch/backend.launch.py'):
         assert (share / path).read_bytes() == (ROOT / path).read_bytes()
     assert module.is_relative_to(workspace)
 

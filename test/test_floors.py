@@ -41,7 +41,6 @@ BLIND = {f'{PACKAGE}.core.{name}': {f'{PACKAGE}.core.{other}' for other in other
          }.items()}
 # More in one folder mix responsibilities; one alone needs none.
 MODULES_OF_A_FOLDER = range(2, 14)
-MODULES_OF_A_FOLDER = range(2, 14)
 LONGEST_MODULE = 420
 LONGEST_FUNCTION = 60
 

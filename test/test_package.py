@@ -133,11 +133,13 @@ def test_every_folder_with_modules_is_a_package():
 def test_ros_finds_the_data_files(wheel):
     data = f'{stem(wheel)}.data/data/'
     names = {name.removeprefix(data) for name in wheel.namelist() if name.startswith(data)}
-    config = {f'share/l1slam_ros/config/{path.name}' for path in (ROOT / 'config').iterdir()}
+    shared = {f'share/l1slam_ros/{folder}/{path.name}' for folder in ('config', 'launch')
+              for path in (ROOT / folder).iterdir() if path.is_file()}
     assert 'share/ament_index/resource_index/packages/l1slam_ros' in names
     assert 'share/l1slam_ros/package.xml' in names
-    assert config <= names
-    assert 'share/l1slam_ros/config/backend.yaml' in names
+    assert shared <= names
+    assert {'share/l1slam_ros/config/backend.yaml',
+            'share/l1slam_ros/launch/backend.launch.py'} <= names
 
 
 def test_ros2_run_finds_executables(wheel):

@@ -110,9 +110,10 @@ def test_the_header_is_what_ament_copyright_looks_for():
 
 # The linters of ROS, and what they are run with. A docstring may begin with a sentence that is
 # no command (D401), and says of those arguments alone something that need it (D417).
-OURS = ('l1slam_ros', 'config', 'setup.py')
+OURS = ('l1slam_ros', 'config', 'launch', 'setup.py')
 LINTERS = {
-    'ament_copyright': ('l1slam_ros', 'test', 'config', 'benchmarks', 'doc', 'setup.py'),
+    'ament_copyright': ('l1slam_ros', 'test', 'config', 'benchmarks', 'doc', 'launch',
+                        'setup.py'),
     'ament_xmllint': ('package.xml',),
     'ament_flake8': ('--config', 'test/ament_flake8.ini', *OURS),
     'ament_pep257': ('--add-ignore', 'D401', 'D417', '--', *OURS),

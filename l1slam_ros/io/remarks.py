@@ -21,6 +21,7 @@ Arrays are in Base64, because writing numbers as text would take most of the tim
 import json
 from base64 import b64decode, b64encode
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from hashlib import sha256
 from itertools import chain
 from typing import Any
@@ -110,17 +111,38 @@ def read_remarks(path: object, content: bytes) -> Remarks:
 
     Raises
     ------
-    FileError : it was one, and is not as it was written.
+    FileError : it was one, and is not as it was written, or a value cannot be read.
 
     """
     if not is_proven(path, content):
         return None
     parts: dict[str, list[Any]] = {}
-    *lines, _ = (line.split(' ', 2)[1:] for line in content.decode().split('\n')
-                 if line.startswith(KEYWORD) and line != _FIRST_OF_2)
-    for name, text in lines:
-        parts.setdefault(name, []).append(_value(text))
-    return {name: _joined(of_name) for name, of_name in parts.items()}
+    with wrong_contents(path):
+        *lines, _ = (line.split(' ', 2)[1:] for line in content.decode().split('\n')
+                     if line.startswith(KEYWORD) and line != _FIRST_OF_2)
+        for name, text in lines:
+            parts.setdefault(name, []).append(_value(text))
+        return {name: _joined(of_name) for name, of_name in parts.items()}
+
+
+@contextmanager
+def wrong_contents(path: object) -> Iterator[None]:
+    """
+    Turn what the values of a saved map raise into a FileError: its checksum proves no contents.
+
+    Raises
+    ------
+    FileError : in place of another error of the block, except of those that it raises on purpose.
+
+    """
+    try:
+        with np.errstate(invalid='raise'):  # no whole number is made of NaN
+            yield
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError,
+            ValueError) as error:
+        missing = isinstance(error, KeyError)
+        what = f'there is no value {error}' if missing else ' '.join(str(error).split())
+        raise FileError(path, f'is a saved map with wrong contents: {what}') from error
 
 
 def _joined(parts: list[Any]) -> Any:

@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from importlib.util import find_spec
 from typing import Any
 
 _BAD_INPUT = 2
@@ -133,6 +134,9 @@ def run(name: str, load: Callable[[], Any], ready: str) -> None:
         # Not before: ROS that is shut down in the middle of that complains of what is half made.
         signals.orderly(rclpy.try_shutdown)
         node.get_logger().info(f'ready: {ready}')
+        if node.options.publish_tf and find_spec('tf2_msgs') is None:
+            node.get_logger().warning('publish_tf is true, but tf2_msgs is not installed (PyPI '
+                                      'has none): this node publishes nothing on /tf')
         _spin(executor, node)
     except L1SlamError as error:
         say(str(error), name)

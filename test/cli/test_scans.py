@@ -13,6 +13,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.io.compilation import JUDGEMENT, SCANS, SPARSE, compile_now
 from l1slam_ros.io.scans.bag_scans import read_bag_scans
 
+DEMO = Path(__file__).parents[2] / 'bags' / 'demo'
 SOLVE = """
 import sys
 from l1slam_ros.cli.main import main
@@ -152,6 +154,20 @@ def test_a_laser_that_is_turned_upside_down_and_ahead_is_read_off_the_transforms
     code, said = solved(capsys, bag, '--scans', '/scan', '--odom-topic', '/wheels',
                         '--reference', truth)
     assert code == 0 and said['ate'] < 0.05
+
+
+def test_of_a_bag_with_scans_and_without_loops_the_option_for_scans_is_named(
+        drive, tmp_path, capsys):
+    bag = tmp_path / 'bag'
+    write_scan_bag(bag, *(part[:60] for part in drive[:2]))
+    code, said = solved(capsys, bag, '--odom-topic', '/wheels')
+    (sentence,) = (text for text in said['warnings'] if '--scans' in text)
+    assert code == 0 and said['loops'] == 0 and '60 scans on /scan' in sentence
+    assert 'with --scans /scan' in sentence
+    assert main(['info', str(bag), '--odom-topic', '/wheels']) == 0
+    assert '--scans /scan' in capsys.readouterr().out
+    # Where there are loops, nothing is missing.
+    assert not any('--scans' in text for text in solved(capsys, DEMO)[1]['warnings'])
 
 
 def test_without_transforms_it_says_where_it_takes_the_laser_to_be(drive, tmp_path, capsys):

@@ -12,6 +12,7 @@ import os
 import signal
 import threading
 import time
+from hashlib import sha256
 
 import numpy as np
 import pytest
@@ -105,6 +106,42 @@ def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, tmp_path, ca
     path.parent.mkdir()
     b.until(lambda: b.status()[0] != DiagnosticStatus.ERROR, 'it is over')
     assert keyframes(path) == 3
+
+
+def hold_nonsense(path):
+    """Let a saved map hold the wrong count of stamps, and prove itself all the same."""
+    lines = [line if not line.startswith('#L1SLAM stamps') else '#L1SLAM stamps [1]'
+             for line in path.read_text().splitlines()[:-1]]
+    content = ''.join(f'{line}\n' for line in lines)
+    path.write_text(f'{content}#L1SLAM sha256 {sha256(content.encode()).hexdigest()}\n')
+
+
+def test_where_the_contents_of_a_map_are_wrong_the_one_before_is_loaded(bench, tmp_path, capfd):
+    path, before = tmp_path / 'map.g2o', tmp_path / 'map.g2o.1'
+    first = bench(save_path=str(path))
+    for last in 4, 5:
+        first.drive(0 if last == 4 else 4, last)
+        first.until(lambda last=last: len(first.path().poses) == last, 'a map')
+        assert call(first, 'save').success
+    hold_nonsense(path)
+    good = before.read_bytes()
+    capfd.readouterr()
+    second = bench(save_path=str(path), load_on_start=True)
+    second.until(lambda: len(second.path().poses) == 4, 'the map before')
+    said = f'4 keyframes loaded from {before}, the map before: {path}: is a saved map with wrong '
+    assert said in capfd.readouterr().err
+    assert said in call(second, 'load').message
+    assert 'held another map' in call(second, 'save').message
+    assert before.read_bytes() == good, 'nonsense does not take its place'
+    for one in path, before:
+        hold_nonsense(one)
+    third = bench(save_path=str(path), load_on_start=True)
+    said = capfd.readouterr().err
+    assert f'the map begins empty: {path}: cannot be loaded: ' in said and 'Traceback' not in said
+    answer = call(third, 'load')
+    assert not answer.success and answer.message.count('wrong contents') == 2
+    third.drive(0, 3)
+    third.until(lambda: len(third.path().poses) == 3, 'it maps all the same')
 
 
 class Robot:

@@ -8,9 +8,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The installed executables as processes: `replay` plays a bag into `backend`, signals end it."""
 
+import importlib.util
 import re
 import signal
 import subprocess
+import threading
 import time
 from collections import Counter
 from contextlib import contextmanager
@@ -169,6 +171,25 @@ def test_replay_waits_for_the_nodes_that_it_is_told_of(bag, ros):
         assert process.returncode == 0
     other.destroy_node()
     late.destroy_node()
+
+
+@pytest.mark.parametrize('name', ['backend', 'scan_loops'])
+@pytest.mark.parametrize('publishes', [True, False])
+def test_a_node_that_cannot_publish_on_tf_warns_once_at_start(name, publishes):
+    command = [executable(name), '--ros-args', '-p', f'publish_tf:={publishes}']
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    patience = threading.Timer(60.0, process.kill)
+    patience.start()
+    try:
+        assert any('ready' in line for line in process.stderr)
+        if publishes and importlib.util.find_spec('tf2_msgs') is None:
+            said = process.stderr.readline()
+            assert 'WARN' in said and 'tf2_msgs is not installed' in said
+        process.send_signal(signal.SIGTERM)
+        assert 'tf2_msgs' not in process.communicate()[1]
+    finally:
+        patience.cancel()
+        process.kill()
 
 
 @pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])

@@ -18,7 +18,13 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from l1slam_ros.io.bags.reader import TopicSummary, bag_summary, read_messages
-from l1slam_ros.io.bags.topics import ABSOLUTE_TOPIC, FALSE_LOOP_TOPIC, ODOMETRY_TYPE, POSE_TYPE
+from l1slam_ros.io.bags.topics import (
+    ABSOLUTE_TOPIC,
+    FALSE_LOOP_TOPIC,
+    ODOMETRY_TYPE,
+    POSE_TYPE,
+    SCAN_TYPE,
+)
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.messages.front_ends import LOOP_TYPES
 
@@ -77,6 +83,16 @@ class LoopCount:
                                  for topic, _ in found)
             yield (f'no loop is in the map, but there are loops in {there}; expected '
                    f'{" or ".join(option for _, option in found)}')
+
+
+def unused_scans(path: Path) -> list[str]:
+    """Return a sentence on the laser scans of a bag, in which loops can be found; none: none."""
+    scans = [topic for topic in bag_summary(path).topics
+             if topic.msgtype == SCAN_TYPE and topic.count]
+    there = ' and '.join(f'{counted(topic.count, "scan")} on {topic.name}' for topic in scans)
+    options = ' or '.join(f'--scans {topic.name}' for topic in scans)
+    return [f'no loop is in the map, but there are {there}; `l1slam solve` with {options} finds '
+            'loops in them'] if scans else []
 
 
 def _unread(path: Path, read: Collection[str],

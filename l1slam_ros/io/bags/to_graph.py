@@ -46,7 +46,7 @@ from l1slam_ros.io.bags.from_graph import (
     TURNED_STEPS,
     VERBATIM_NOTE,
 )
-from l1slam_ros.io.bags.lost_loops import LoopCount
+from l1slam_ros.io.bags.lost_loops import LoopCount, unused_scans
 from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import (
     ABSOLUTE_TOPIC,
@@ -118,7 +118,8 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
                 f'no messages on {topic}; expected {topics.types()[topic]}',
                 *_alternatives(path, topic, topics.types()[topic]), *damage]))
         lost = [f'no messages on {topic}', *lost]
-    return replace(record, damage='; '.join([*damage, *lost]))
+    scans = unused_scans(path) if record.graph.between.is_odometry.all() else ()
+    return replace(record, damage='; '.join([*damage, *lost]), skipped=(*record.skipped, *scans))
 
 
 class _Growing:

@@ -60,7 +60,7 @@ from l1slam_ros.io.graphs.rows import (
 from l1slam_ros.io.graphs.side_files import loops_between, named_loops, read_stamps, write_beside
 from l1slam_ros.io.graphs.tags import FACTORS, NO_OFFSET, TAGS
 from l1slam_ros.io.ours import MARK
-from l1slam_ros.io.remarks import Remarks
+from l1slam_ros.io.remarks import Remarks, wrong_contents
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,10 @@ def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
 
 
 def _stamps(path: str | os.PathLike[str], ids: Indices, remarks: Remarks) -> Indices | None:
-    return np.array(remarks['stamps'], np.int64) if remarks else read_stamps(path, ids)
+    if not remarks:
+        return read_stamps(path, ids)
+    with wrong_contents(path):
+        return np.array(remarks['stamps'], np.int64).reshape(ids.shape)
 
 
 def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, edges: Rows,
@@ -231,8 +234,13 @@ def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, e
         mark_landmarks(graph, ids, i, j)
     roots = roots_of(path, edges)
     doubted = BetweenFactors(i, j, edges.pose, roots, none, none, graph.predecessor)
-    trusted, struck = (remarks['trusted'], remarks['struck']) if remarks else (
-        named_loops(path, name, ids, doubted) for name in ('trusted', 'struck'))
+    if remarks:
+        with wrong_contents(path):
+            trusted, struck = (np.array(remarks[name], bool).reshape(len(edges))
+                               for name in ('trusted', 'struck'))
+    else:
+        trusted, struck = (named_loops(path, name, ids, doubted)
+                           for name in ('trusted', 'struck'))
     true = trusted | loops_between(ids, doubted, vouched)
     graph.append_between(i, j, edges.pose, roots, true & ~struck & ~struck_here,
                          (struck & ~trusted) | struck_here)

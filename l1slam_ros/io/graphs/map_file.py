@@ -146,7 +146,8 @@ class MapFile:
         self._tried = True
         if saved is not None and self._robots:
             saved = replace(saved, robots=self._robots)
-        sentence = save_map(path, saved)
+        # A file of others has another name by now. It may hold nonsense, unlike the map before.
+        sentence = save_map(path, saved, self._ours[:2] == (path, _end_of(path)))
         self._known = path, revision
         self._ours = path, _end_of(path), saved.graph_began if saved else 0
         self._ours_before = before_of(path), _end_of(before_of(path))

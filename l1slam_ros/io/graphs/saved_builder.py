@@ -13,16 +13,27 @@ In: the state of a builder. Out: values that JSON can hold, and the state again.
 names no robots, so that maps which were saved before there were several are read alike.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from operator import index
 from typing import Any
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry import se3
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.graph.parts import give_to
 from l1slam_ros.core.online.builder_state import BuilderState, LoopsState, TrackEnd
+from l1slam_ros.io.files import LARGEST
+
+# Of a value of a saved map: its name, itself as an array, the shape and the range it must have.
+Limits = tuple[str, np.ndarray, tuple[int, ...], tuple[float, float]]
+ANY = -np.inf, np.inf
+FINITE = -LARGEST, LARGEST
+_ROBOT = 0, 2**31
+# [bytes] Of the key of a loop in `LoopsState.seen`, without its robots.
+_IDENTITY = 16
 
 
 def values_of(state: BuilderState) -> dict[str, Any]:
@@ -65,20 +76,62 @@ def restored(state: BuilderState, saved: Mapping[str, Any]) -> BuilderState:
         odometry=_floats(values['odometry']).reshape(poses), loops=_loops(values))
 
 
+def limits_of(state: BuilderState) -> Iterator[Limits]:
+    """Yield the limits of a state's values: what is beyond them, no map can have."""
+    graph, loops, robots = state.graph, state.loops, np.unique(state.graph.robot)
+    n, m = len(state.stamps), len(graph.between)
+    d, p = graph.manifold.TANGENT_SIZE, graph.manifold.POSE_SIZE
+    yield 'odometry', _normalised(graph.manifold, state.odometry), (n, p), FINITE
+    yield 'keyframe_robots', graph.robot, (n,), _ROBOT
+    yield 'robot', np.sort([end.robot for end in state.ends]) - robots, robots.shape, (0, 0)
+    for end in state.ends:
+        for pose in end.offset, end.end_pose:
+            yield 'end_pose', _normalised(graph.manifold, pose), (1, p), FINITE
+        yield 'end', np.array(index(end.end), np.int64), (), ANY
+        yield 'end_covariance', end.end_covariance, (d, d), ANY
+    k, expired, struck, seen = map(len, (loops.rows, loops.expired, loops.struck_pairs,
+                                         loops.seen))
+    yield 'loop_rows', loops.rows, (k,), (0, m - 1)
+    yield 'loop_stamps', loops.stamps, (k, 2), ANY
+    yield 'loop_robots', loops.robots, (k, 2), _ROBOT
+    yield 'expired_robots', loops.expired_robots, (expired, 2), _ROBOT
+    yield 'struck_pairs', loops.struck_pairs, (struck, 2), (0, n - 1)
+    yield 'seen', np.array([*loops.seen.values()], np.int64), (seen,), (-1, m - 1)
+    for key in loops.seen:
+        named = np.frombuffer(key[_IDENTITY:], np.int64)
+        yield 'seen', np.array(len(key)), (), (_IDENTITY, 2 * _IDENTITY)
+        yield 'seen', named, (2,) if len(named) else (0,), _ROBOT
+    for loop, age in loops.waiting:
+        yield 'waiting', np.array((*loop.stamps, age), np.int64), (3,), ANY
+        yield 'waiting', np.array(loop.robots), (2,), _ROBOT
+        yield 'waiting', _normalised(se3, loop.pose3[None]), (1, 7), FINITE
+
+
+def _normalised(manifold: Manifold, poses: Array) -> Array:
+    """Return poses with quaternions of norm 1; of a quaternion without a direction NaN."""
+    with np.errstate(all='ignore'):
+        return manifold.from_pose3(manifold.to_pose3(poses))
+
+
 def _loops(values: dict[str, Any]) -> LoopsState:
     stamps, expired = _pairs(values['loop_stamps']), _pairs(values['expired'])
     robots, expired_robots = (
         _pairs(values.get(name, np.zeros_like(of)))
         for name, of in (('loop_robots', stamps), ('expired_robots', expired)))
-    waiting = tuple(
-        (LoopClosure(reference, stamp, np.array(pose3), np.array(covariance), trusted, struck,
-                     *robots[::-1]), age)
-        for reference, stamp, trusted, struck, age, pose3, covariance, *robots
-        in values['waiting'])
+    waiting = tuple(_waiting(*loop) for loop in values['waiting'])
     seen = {bytes.fromhex(key): row for key, row in values['seen']}
     return LoopsState(
         np.array(values['loop_rows'], np.int64), stamps, robots, expired, expired_robots, waiting,
         seen, _pairs(values['struck_pairs']))
+
+
+def _waiting(reference: Any, stamp: Any, trusted: Any, struck: Any, age: Any, pose3: Any,
+             covariance: Any, *robots: Any) -> tuple[LoopClosure, int]:
+    """Return a loop that waits, and for how long it has [ns]."""
+    return LoopClosure(
+        None if reference is None else index(reference), index(stamp), _floats(pose3).reshape(7),
+        _floats(covariance).reshape(6, 6), bool(trusted), bool(struck),
+        *map(index, robots[::-1])), index(age)
 
 
 def _floats(values: Any) -> Array:

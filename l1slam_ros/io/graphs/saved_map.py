@@ -15,6 +15,7 @@ The new file takes its place by one rename. The previous one stays beside it, as
 import glob
 import os
 import shutil
+from collections.abc import Iterator
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,23 +23,34 @@ from typing import Any, TypeVar
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.snapshot import SavedMap
 from l1slam_ros.io.bounded import open_regular
-from l1slam_ros.io.files import other_kind, put_lines, replacing
+from l1slam_ros.io.files import LARGEST, other_kind, put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph_file
 from l1slam_ros.io.graphs.left_out import SUSPECT, left_out_by
-from l1slam_ros.io.graphs.saved_builder import restored, values_of
-from l1slam_ros.io.remarks import is_proven, with_remarks
+from l1slam_ros.io.graphs.saved_builder import (
+    ANY,
+    FINITE,
+    Limits,
+    limits_of,
+    restored,
+    values_of,
+)
+from l1slam_ros.io.remarks import is_proven, with_remarks, wrong_contents
 
 _Record = TypeVar('_Record', Optimised, Judgement)
+_POSITIVE = 1e-30, LARGEST
 
 
-def save_map(path: Path, saved: SavedMap | None) -> str:
+def save_map(path: Path, saved: SavedMap | None, keep: bool = True) -> str:
     """
     Write a map and return a sentence that says so.
+
+    keep : the file that is replaced becomes the previous map
 
     Raises
     ------
@@ -51,7 +63,8 @@ def save_map(path: Path, saved: SavedMap | None) -> str:
                          left_out=_left_out(saved), drift=saved.judgement.drift)
     with replacing(path) as temporary:
         put_lines(temporary, with_remarks(graph_lines(path, record), _remarks(saved)))
-        _keep(path)
+        if keep:
+            _keep(path)
     _remove_leftovers(path)
     return f'{_count(saved)} keyframes saved to {path}'
 
@@ -169,12 +182,52 @@ def _read(path: Path) -> SavedMap:
     values = dict(record.remarks or {})
     if not values:
         return SavedMap(state, optimised, Judgement.nothing(), True)
-    doubts = tuple(
-        Doubt(**doubt | {'pairs': tuple((i, j) for i, j in doubt.get('pairs', ()))})
-        for doubt in values['doubts'])
-    judgement = _restored(Judgement.nothing(), values | {'doubts': doubts})
-    return SavedMap(restored(state, values), _restored(optimised, values), judgement,
-                    values['robust'], robots=tuple(values.get('robots', ())))
+    with wrong_contents(path):
+        doubts = tuple(
+            Doubt(**doubt | {'pairs': tuple((i, j) for i, j in doubt.get('pairs', ()))})
+            for doubt in values['doubts'])
+        judgement = _restored(Judgement.nothing(), values | {'doubts': doubts})
+        saved = SavedMap(restored(state, values), _restored(optimised, values), judgement,
+                         values['robust'], robots=tuple(values.get('robots', ())))
+        _require_sound(saved)
+    return saved
+
+
+def _require_sound(saved: SavedMap) -> None:
+    """
+    Check the sizes and ranges of what a file holds, before a back end goes on with it.
+
+    Raises
+    ------
+    ValueError : naming a value that cannot be that of a map.
+
+    """
+    for name, values, shape, (low, high) in (*limits_of(saved.builder), *_limits(saved)):
+        if values.shape != shape or not ((values >= low) & (values <= high)).all():
+            raise ValueError(f'{name} is no array {shape} of values from {low:g} to {high:g}')
+
+
+def _limits(saved: SavedMap) -> Iterator[Limits]:
+    """Yield the limits of a map and its judgement, see `limits_of`."""
+    optimised, judgement, graph = saved.optimised, saved.judgement, saved.builder.graph
+    n, m, d = len(optimised.poses), len(graph.between), graph.manifold.TANGENT_SIZE
+    judged, size = (min(len(judgement.accepted), m),), (0, np.inf)
+    yield 'stamps', saved.builder.stamps, (n,), ANY
+    yield 'dual', optimised.dual, (m * d,), FINITE
+    yield 'cost', np.array(optimised.cost), (), size
+    yield 'accepted', judgement.accepted, judged, (False, True)
+    yield 'suspect', judgement.suspect, judged, (False, True)
+    yield 'sigmas', np.nan_to_num(judgement.sigmas), judged, size
+    yield 'noise', judgement.noise, judged, _POSITIVE
+    yield 'variance', judgement.variance, (2,), _POSITIVE
+    yield 'meant', judgement.meant, (2, judgement.meant.shape[1]), _POSITIVE
+    # Only in the plane is a drift looked for.
+    yield 'drift', np.array(judgement.drift), (), FINITE if graph.manifold is se2 else (0, 0)
+    yield 'robust', np.array(saved.robust), (), (False, True)
+    yield 'slips', judgement.slips, (len(judgement.slips),), (0, m - 1)
+    for doubt in judgement.doubts:
+        pairs = np.array([(doubt.first, doubt.last), *doubt.pairs], np.int64)
+        yield 'doubts', pairs, (len(pairs), 2), (0, n - 1)
 
 
 def _restored(record: _Record, values: dict[str, Any]) -> _Record:

@@ -10,6 +10,7 @@
 
 import os
 import re
+from base64 import b64encode
 from dataclasses import fields, is_dataclass, replace
 from hashlib import sha256
 
@@ -219,6 +220,62 @@ def test_what_is_damaged_is_noticed_and_the_map_before_taken(two, rng):
                         + '(:1)?: ', said)
     two.write_bytes(content)
     assert load_map(two)[1] == f'6 keyframes loaded from {two}'
+
+
+def numbers(*values, kind='<f8'):
+    return f'{kind} {b64encode(np.array(values, kind).tobytes()).decode()}'
+
+
+# Values of a map of six keyframes in a row, which begin one of its comment lines.
+WRONG = {
+    'stamps': ('', numbers(1, 2, kind='<i8'), '"x"', 'nonsense', numbers(*[np.nan] * 6)),
+    'odometry': (numbers(0, 0, 0), numbers(*[np.nan] * 18), numbers(*[1e300] * 18)),
+    'offset': ('[]', '[null]', numbers(0, 0)),
+    'end': ('null', '"x"', '1e300', '99999999999999999999'),
+    'end_covariance': (numbers(1, 2, 3), '[[1]]'),
+    'loop_rows': (numbers(7, kind='<i8'), numbers(-1, kind='<i8')),
+    'struck_pairs': (numbers(0, 9, kind='<i8'), numbers(0, kind='<i8')),
+    'seen': ('[["00",0]]', '[["zz",0]]', '[["' + 32 * '0' + '",9]]', '[1]'),
+    'waiting': ('[1]', '[[1,2,3]]', f'[["x",2,false,false,0,{[0] * 7},{[[0] * 6] * 6}]]',
+                f'[[1,2,false,false,0,{[0] * 7},{[[0] * 6] * 6}]]'),
+    'dual': ('', '[]', numbers(1), numbers(*[np.nan] * 15)),
+    'status': ('"nonsense"', '7'),
+    'accepted': (numbers(*[1] * 9, kind='|b1'), '3'),
+    'sigmas': (numbers(1),),
+    'variance': (numbers(1), numbers(0, -1), numbers(np.nan, np.nan)),
+    'slips': (numbers(5, kind='<i8'),),
+    'doubts': ('[{}]', '[1]', '{"kind":1}',
+               '[{"kind":"parts","loops":1,"first":0,"last":9,"detail":"","pairs":[]}]'),
+    'robust': ('"yes"', 'null', '[' * 9000),
+    'trusted': (numbers(1, kind='|b1'), 'null'),
+}
+
+
+def hold(path, name, value):
+    """Let a saved map hold another value, or none if it is empty, and prove itself as before."""
+    lines = [line for line in path.read_text().splitlines()[:-1]
+             if not line.startswith(f'#L1SLAM {name} ')]
+    content = ''.join(f'{line}\n' for line in (*lines, f'#L1SLAM {name} {value}')[:len(
+        lines) + bool(value)])
+    path.write_text(f'{content}#L1SLAM sha256 {sha256(content.encode()).hexdigest()}\n')
+
+
+@pytest.mark.parametrize('name', WRONG)
+def test_where_the_contents_are_wrong_the_map_before_is_taken(two, capsys, name):
+    content, before = two.read_bytes(), two.with_name('map.g2o.1')
+    for value in WRONG[name]:
+        two.write_bytes(content)
+        hold(two, name, value)
+        assert is_map(two)
+        saved, said, whole = load_map(two)
+        assert len(saved.optimised.poses) == 5 and not whole
+        assert said.startswith(f'5 keyframes loaded from {before}, the map before: {two}: is a '
+                               'saved map with wrong contents: '), said
+    before.write_bytes(two.read_bytes())
+    with pytest.raises(FileError, match='cannot be loaded: .*wrong contents.*wrong contents'):
+        load_map(two)
+    main(['info', str(two)])
+    assert 'Traceback' not in capsys.readouterr().err
 
 
 def test_what_is_missing_is_noticed_and_the_map_before_taken(two):
