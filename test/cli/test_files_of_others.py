@@ -252,8 +252,7 @@ def test_a_fifo_in_a_bag_is_not_waited_for(capsys, tmp_path, name):
     (tmp_path / 'bag' / name).unlink(missing_ok=True)
     os.mkfifo(tmp_path / 'bag' / name)
     (tmp_path / 'bag' / 'bag_1.mcap').write_bytes(b'')
-    assert one_line(capsys, 'info', tmp_path / 'bag').endswith(
-        f'bag/{name}: cannot be read: it is not a regular file\n')
+    assert 'bag: damaged, or not a bag (' in one_line(capsys, 'info', tmp_path / 'bag')
 
 
 def test_yaml_whose_aliases_expand_without_end_is_refused(capsys, tmp_path):

@@ -59,7 +59,7 @@ def test_a_room_that_looks_the_same_turned_round_is_doubted(tmp_path, capsys):
 
 def test_without_scans_nothing_joins_them(two_drives, tmp_path, capsys):
     out, said = run(capsys, 'merge', two_drives / 'first.clf', two_drives / 'second.clf',
-                    '--output', tmp_path / 'out.g2o', '--json')
+                    '--output', tmp_path / 'out.g2o', '--json', code=4)
     assert json.loads(out)['parts'] == 2 and 'a part of its own' in said
 
 
