@@ -84,9 +84,10 @@ def test_information_that_is_not_definite_costs_one_line_and_no_map(capsys, buil
             lines[k] = ' '.join([*words[:10], *map(repr, information[upper].tolist())])
             count += 1
     building.write_text('\n'.join(lines) + '\n')
-    report = solve_json(capsys, building, *truth)
-    warning, = report['warnings']
+    report = solve_json(capsys, building, *truth, code=4)  # of so much noise it is not sure
+    warning, _ = report['warnings']
     assert count > 100 and warning.startswith(f'{count} of 330 information matrices not positive ')
-    assert report['status'] == 'converged' and report['rejected'] == []
+    assert [doubt['kind'] for doubt in report['doubts']] == ['a weak map']
+    assert report['rejected'] == []
     assert report['ate'] < 2 * clean['ate'] + 0.1
     assert f'- {warning}\n' in run(capsys, 'info', building, *truth[2:])[0]

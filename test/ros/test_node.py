@@ -216,4 +216,6 @@ def test_the_solver_never_starves_the_callbacks(bench, tmp_path, rng):
             'odometry is answered')
     assert not answer.done(), 'the solver was done before the callbacks: make the world larger'
     b.until(answer.done, 'the solver answers')
-    assert answer.result().success
+    # What was driven meanwhile no loop joins to the map that was loaded.
+    found = answer.result()
+    assert found.success or ' joins 2 parts of the map' in found.message
