@@ -319,3 +319,23 @@ def test_the_jump_of_the_transform_is_said(bench):
     b.until(lambda: 0.01 < float(b.status()[2].get('jump.translation', 0)) < 1.01, 'a jump')
     b.until(lambda: b.path().poses[-1].pose.position.x == pytest.approx(4.0, abs=0.01),
             'a metre in all')
+
+
+def test_no_executor_is_woken_by_a_message(bench):
+    """Each time it would make its wait set anew, ten times the work of a message."""
+    b = bench(**{'robust.enabled': False})
+    b.until(lambda: b.received['/diagnostics'], 'the node is up')
+    took = [one for one in (*b.backend.subscriptions, *(
+        event for one in b.backend.subscriptions for event in one.event_handlers))
+        if b.executor.can_execute(one)]
+    assert {one.topic_name for one in took if hasattr(one, 'topic_name')} <= {
+        '/clock', '/parameter_events'} and all(hasattr(one, 'topic_name') for one in took)
+
+
+def test_of_robots_that_nobody_named_only_the_first_are_kept(bench):
+    b = bench(robots=['r1', 'r2'])
+    b.send('/r1/odom', odometry(10**9, 0.0))
+    for k in range(60):
+        b.send('/r1/loop_closures', loop(5 * 10**9, frame=f'x{k}/base_link@1.000000000'))
+    b.until(lambda: b.count('refused.robot') == 60, 'they are counted')
+    assert len(b.backend._inputs._strangers) == 21
