@@ -166,8 +166,9 @@ class Bench:
 
     def close(self):
         self.executor.shutdown()
-        self.backend.close()
+        ended = self.backend.close()
         self.peer.destroy_node()
+        return ended
 
 
 def header(frame, stamp):

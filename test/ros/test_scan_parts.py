@@ -8,7 +8,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `scan_loops` is made of, each alone: the queue, the odometry it states, mounts, options."""
 
-import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -38,7 +37,6 @@ from l1slam_ros.ros.scans.placing import Placing
 from l1slam_ros.ros.scans.scan_odometry import IncrementalOdometry
 from l1slam_ros.ros.scans.scan_queue import ScanQueue
 from l1slam_ros.ros.shell.header import header
-from l1slam_ros.ros.shell.installed import executable
 
 SHIPPED = Path(__file__).parents[2] / 'config' / 'scan_loops.yaml'
 S = 10**9
@@ -319,16 +317,3 @@ def test_the_shipped_file_equals_the_defaults_and_suits_the_back_end():
                         if line.lstrip().startswith('#'))
     for name, (_, meaning) in flatten(front_end).items():
         assert ' '.join(meaning.doc.split()) in comments, name
-
-
-def test_help_lists_topics_services_and_parameters():
-    helped = subprocess.run([executable('scan_loops'), '--help'], capture_output=True, text=True)
-    assert helped.returncode == 0 and not helped.stderr
-    for word in ('scan_odom', '~/save_map', 'laser_pose', 'map_resolution: 0.05', 'covariance'):
-        assert word in helped.stdout
-
-
-def test_an_unknown_argument_starts_nothing():
-    ran = subprocess.run([executable('scan_loops'), '--loops'], capture_output=True, text=True)
-    assert ran.returncode == 2
-    assert ran.stderr.startswith("scan_loops: '--loops' is not an argument of scan_loops")
