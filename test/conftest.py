@@ -107,7 +107,7 @@ def bench(ros):
 @pytest.fixture
 def start():
     """Return what starts the node as a process, in a session of its own; it ends with the test."""
-    from l1slam_ros.ros.shell.installed import executable
+    from node_bench import executable
 
     processes = []
 

@@ -8,29 +8,48 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node under test in this process, and a peer that talks to it over real DDS."""
 
+import os
+import sysconfig
 import time
+from collections import Counter
+from pathlib import Path as File
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.io.bags.reader import read_raw
+from bags import recording_of
+
+# What the executables start.
 from l1slam_ros.ros.node import BackendNode
-from l1slam_ros.ros.shell.header import header
+from l1slam_ros.ros.scans.node import ScanLoopsNode as ScanLoopsNode
 
 DEADLINE = 60.0
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+OF_LOOPS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SECOND = 10**8  # [ns] a second of the node's diagnostics
 TYPES = {'/odom': Odometry, **dict.fromkeys(
     ('/loop_closures', '/trusted_loop_closures', '/false_loop_closures', '/absolute_poses'),
     PoseWithCovarianceStamped)}
 EVERY_MESSAGE = {'keyframe.translation': 0.0, 'keyframe.rotation': 0.0,
                  'odometry.covariance_source': 'increment'}
+
+
+def executable(name):
+    """Return where an executable of ours is: where `ros2 run` looks, or beside Python."""
+    folders = [File(prefix) / 'lib' / 'l1slam_ros'
+               for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if prefix]
+    beside = File(sysconfig.get_path('scripts'))
+    return str(next(path / name for path in (*folders, beside)
+                    if path is beside or (path / name).exists()))
 
 
 class Bench:
@@ -53,19 +72,20 @@ class Bench:
             topic: self.peer.create_publisher(kind, topic, QoSProfile(depth=1000))
             for topic, kind in ((f'/{name}{topic[1:]}', kind) for name in names
                                 for topic, kind in TYPES.items())}
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.received = {f'{name}{topic}': [] for name in names
-                         for topic in ('path', 'pose', 'map_to_odom')} | {'/diagnostics': []}
+        self.received = {}
         for name in names:
-            self.listen(Path, f'{name}path', latched)
+            self.listen(Path, f'{name}path', LATCHED)
             self.listen(PoseStamped, f'{name}pose', 1000)
             self.listen(TransformStamped, f'{name}map_to_odom', 1000)
         self.listen(DiagnosticArray, '/diagnostics', 100)
+        self.listen(DiagnosticArray, 'loop_status', OF_LOOPS)
         self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()),
                    'the node subscribes')
 
     def listen(self, kind, topic, qos):
+        self.received[topic] = []
         self.peer.create_subscription(kind, topic, self.received[topic].append, qos)
+        return self.received[topic]
 
     def until(self, condition, what):
         deadline = time.monotonic() + DEADLINE
@@ -84,12 +104,17 @@ class Bench:
 
     def play(self, bag):
         """Play a bag as fast as it is used: a burst is more than DDS holds on a busy machine."""
-        sent, heard = 0, self.backend._inputs.traffic['odom']
-        for message in read_raw(bag):
-            self.send(message.topic, message.data)
-            sent += message.topic == '/odom'
-            if sent % 20 == 0:
-                self.until(lambda n=sent: heard.received >= n, 'they are used')
+        sent = 0
+        for topic, _, stamp, data in recording_of(bag):
+            self.send(topic, data)
+            sent += topic == '/odom'
+            if topic == '/odom' and sent % 20 == 0:
+                self.until(lambda stamp=stamp: self.newest() >= stamp, 'they are used')
+
+    def newest(self, name=''):
+        """Return the stamp [ns] of the newest odometry of a robot that was answered, or 0."""
+        poses = self.received[f'{name}pose']
+        return stamp_of(poses[-1].header) if poses else 0
 
     def path(self):
         return self.received['path'][-1] if self.received['path'] else Path()
@@ -98,13 +123,68 @@ class Bench:
         """Return the last level, sentence and values that the node said of itself."""
         if not self.received['/diagnostics']:
             return None, '', {}
-        (status,) = self.received['/diagnostics'][-1].status
+        status = self.received['/diagnostics'][-1].status[0]
         return status.level, status.message, {v.key: v.value for v in status.values}
+
+    def count(self, key):
+        """Return a number that diagnostics last gave, 0: none."""
+        return int(self.status()[2].get(key, 0))
+
+    def refused(self):
+        """Return how many messages were refused, by cause, as diagnostics last gave it."""
+        return {key.removeprefix('refused.'): int(value) for key, value in self.status()[2].items()
+                if key.startswith('refused.') and not key.endswith('.last_minute')}
+
+    def anew(self):
+        """Wait until diagnostics have come that were made after this."""
+        self.received['/diagnostics'].clear()
+        self.until(lambda: len(self.received['/diagnostics']) > 1, 'diagnostics')
+
+    def rest(self):
+        """Wait until nothing is left to do."""
+        self.anew()
+        self.until(lambda: self.status()[2]['behind.at_rest'] == '1', 'it is at rest')
+
+    def loops(self):
+        """
+        Return the state of each loop and its sigmas, NaN: none.
+
+        By the stamps of its ends; where robots have names, by these and the stamps.
+        """
+        found = {}
+        for message in self.received['loop_status']:
+            for one in message.status:
+                values = {v.key: v.value for v in one.values}
+                names = [values[key] for key in ('reference_robot', 'robot') if key in values]
+                ends = [nanoseconds(values[key]) for key in ('reference_stamp', 'stamp')]
+                found[(*names, *ends)] = values['state'], float(values['sigmas'] or 'nan')
+        return found
+
+    def states(self):
+        """Return how many loops are in each state."""
+        return Counter(state for state, _ in self.loops().values())
 
     def close(self):
         self.executor.shutdown()
-        self.backend.close()
+        ended = self.backend.close()
         self.peer.destroy_node()
+        return ended
+
+
+def header(frame, stamp):
+    """Return a header; stamp [ns]."""
+    seconds, rest = divmod(int(stamp), 10**9)
+    return Header(frame_id=frame, stamp=Time(sec=seconds, nanosec=rest))
+
+
+def stamp_of(header):
+    """Return the stamp of a header [ns]."""
+    return header.stamp.sec * 10**9 + header.stamp.nanosec
+
+
+def nanoseconds(text):
+    """Return a time [ns] written in seconds with nine digits."""
+    return int(text.replace('.', ''))
 
 
 def odometry(stamp, x, frame='base_link'):
@@ -121,10 +201,18 @@ def loop(stamp, x=0.0, frame='base_link@1.000000000', variance=0.0):
 
 
 def poses_of(path):
-    return se2.from_pose3(np.array([
-        (p.pose.position.x, p.pose.position.y, p.pose.position.z, p.pose.orientation.x,
-         p.pose.orientation.y, p.pose.orientation.z, p.pose.orientation.w)
-        for p in path.poses]).reshape(-1, 7))
+    """Return the poses of a Path in the plane, x y yaw, (n, 3)."""
+    p = np.array([(p.pose.position.x, p.pose.position.y, p.pose.orientation.z,
+                   p.pose.orientation.w) for p in path.poses]).reshape(-1, 4)
+    yaw = 2 * np.arctan2(p[:, 2], p[:, 3])
+    return np.column_stack((p[:, :2], yaw - 2 * np.pi * np.rint(yaw / (2 * np.pi))))
+
+
+def put(pose, position, quaternion):
+    """Set a Pose."""
+    pose.position.x, pose.position.y, pose.position.z = map(float, position)
+    (pose.orientation.x, pose.orientation.y, pose.orientation.z,
+     pose.orientation.w) = map(float, quaternion)
 
 
 def begin(b, name, request=None, kind=None):
@@ -140,3 +228,17 @@ def call(b, name, request=None, kind=None):
     future = begin(b, name, request, kind)
     b.until(future.done, f'{name} answers')
     return future.result()
+
+
+def set_parameter(b, name, value):
+    """Set a parameter of the node; return why it is refused, empty: it is not."""
+    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+    (result,) = call(b, 'set_parameters', request, SetParameters).results
+    assert result.successful == (not result.reason)
+    return result.reason
+
+
+def parameters_of(b, *names):
+    """Return the values of parameters of the node."""
+    answer = call(b, 'get_parameters', GetParameters.Request(names=names), GetParameters)
+    return [parameter_value_to_python(value) for value in answer.values]

@@ -49,7 +49,7 @@ NOT_RUN = {
     'source install': 'no ROS installation here; test_builds.py sources a workspace',
     'colcon ': 'no ROS installation here; test_package.py and test_builds.py build the package',
     'ros2 ': 'no ros2cli here; its nodes are run as .venv/bin/..., and by test_launch.py',
-    'rviz2 ': 'no RViz here; its layout is held to the topics by test/ros',
+    'rviz2 ': 'no RViz here; its layout is held to the topics by test/node',
     'apt-get ': 'installs packages of the system',
     'pip install': 'fetches from PyPI; test_builds.py installs what is built',
     'ament_': 'linters of ROS; test_release.py runs them',

@@ -8,7 +8,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `scan_loops` is made of, each alone: the queue, the odometry it states, mounts, options."""
 
-import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,15 +21,13 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
 from rclpy.serialization import serialize_message
 
-from l1slam_ros.core.errors import MessageError, OptionError
+from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import OdometrySample
-from l1slam_ros.core.options import dotted, flatten
 from l1slam_ros.core.running.backend import Backend, BackendOptions
 from l1slam_ros.core.scans.odometry import ScanKeyframes, Step
 from l1slam_ros.core.scans.points import Mount, Scan
 from l1slam_ros.core.scans.submaps import Keyframe
-from l1slam_ros.io.node_options import NodeOptions, read_params_file
 from l1slam_ros.ros.scans.messages import path_in, scan_in, whole
 from l1slam_ros.ros.scans.mounting import StaticTransforms
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
@@ -38,7 +35,6 @@ from l1slam_ros.ros.scans.placing import Placing
 from l1slam_ros.ros.scans.scan_odometry import IncrementalOdometry
 from l1slam_ros.ros.scans.scan_queue import ScanQueue
 from l1slam_ros.ros.shell.header import header
-from l1slam_ros.ros.shell.installed import executable
 
 SHIPPED = Path(__file__).parents[2] / 'config' / 'scan_loops.yaml'
 S = 10**9
@@ -223,15 +219,6 @@ def test_a_laser_pose_is_a_text_or_a_list(given, expected):
     assert ScanLoopsOptions(laser_pose=given).mount() == expected
 
 
-@pytest.mark.parametrize('values, said', [
-    ({'laser_pose': '1, 2'}, 'expected x, y, yaw'), ({'laser_pose': 'ahead'}, 'expected x, y'),
-    ({'laser_pose': '0 0 0 1.57'}, 'roll of 1.57'), ({'map_path': '/maps/a.png'}, 'a .pgm file'),
-    ({'odom_frame': ''}, 'odom_frame is empty')])
-def test_nonsense_is_refused(values, said):
-    with pytest.raises(OptionError, match=said):
-        ScanLoopsOptions(**values)
-
-
 def laser_scan(count=10, increment=0.1, **changes):
     values = {'angle_min': 0.0, 'angle_increment': increment, 'range_min': 0.1, 'range_max': 8.0,
               'time_increment': 0.0, 'ranges': [1.0] * count}
@@ -303,32 +290,3 @@ def read_params_file_of(name):
         'odom_frame': 'scan_odom'} if name != 'backend' else {
         key: value for key, value in yaml.safe_load(SHIPPED.read_text())[
             '/**/backend']['ros__parameters'].items() if key != 'odom_frame'}
-
-
-def test_the_shipped_file_equals_the_defaults_and_suits_the_back_end():
-    content = yaml.safe_load(SHIPPED.read_text())
-    shipped = dict(dotted(content['/**/scan_loops']['ros__parameters']))
-    assert shipped == {name: value for name, (value, _) in flatten(ScanLoopsOptions()).items()}
-    backend = read_params_file(SHIPPED)
-    front_end = ScanLoopsOptions()
-    assert backend.odometry.covariance_source == 'increment'
-    assert (backend.keyframe.translation, backend.keyframe.rotation, backend.keyframe.period) == (
-        front_end.keyframe.translation, front_end.keyframe.rotation, front_end.keyframe.period)
-    assert backend.odom_frame == front_end.odom_frame != NodeOptions().odom_frame
-    comments = ' '.join(line.strip(' #') for line in SHIPPED.read_text().splitlines()
-                        if line.lstrip().startswith('#'))
-    for name, (_, meaning) in flatten(front_end).items():
-        assert ' '.join(meaning.doc.split()) in comments, name
-
-
-def test_help_lists_topics_services_and_parameters():
-    helped = subprocess.run([executable('scan_loops'), '--help'], capture_output=True, text=True)
-    assert helped.returncode == 0 and not helped.stderr
-    for word in ('scan_odom', '~/save_map', 'laser_pose', 'map_resolution: 0.05', 'covariance'):
-        assert word in helped.stdout
-
-
-def test_an_unknown_argument_starts_nothing():
-    ran = subprocess.run([executable('scan_loops'), '--loops'], capture_output=True, text=True)
-    assert ran.returncode == 2
-    assert ran.stderr.startswith("scan_loops: '--loops' is not an argument of scan_loops")

@@ -12,15 +12,14 @@ import signal
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 rclpy = pytest.importorskip('rclpy')
 
 from std_srvs.srv import Trigger
+from worlds import as_map, made
 
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+import l1slam_ros as l1
 
 DEADLINE = 60.0
 # [s] Two are promised; a busy machine takes its part.
@@ -100,11 +99,7 @@ def test_while_it_compiles(start, tmp_path):
 
 @pytest.fixture(scope='module')
 def large(tmp_path_factory):
-    world = simulate_world(8000, 13000, WorldOptions(), np.random.default_rng(0))
-    path = tmp_path_factory.mktemp('large') / 'map.g2o'
-    write_graph_file(path, GraphRecord(world.graph, world.odometry, np.arange(8000),
-                                       10**9 + 10**8 * np.arange(8000)))
-    return path
+    return as_map(made(tmp_path_factory.mktemp('large') / 'map.g2o', 8000, 13000))
 
 
 @pytest.mark.parametrize('service', ['load', 'save', 'optimize'])
@@ -126,7 +121,7 @@ def test_while_it_works(start, ros, large, service):
     until(lambda: time.monotonic() > moment, 'it is at work')
     assert_ends(process, signal.SIGTERM)
     node.destroy_node()
-    assert read_graph_file(large).graph.n_poses == 8000
+    assert l1.read_graph(large)[0].n_poses == 8000
     assert not list(large.parent.glob('.*'))
 
 

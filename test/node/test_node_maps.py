@@ -10,7 +10,6 @@
 
 import os
 import signal
-import threading
 import time
 from hashlib import sha256
 
@@ -22,21 +21,19 @@ rclpy = pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from node_bench import begin, call, odometry, poses_of
-from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from node_bench import LATCHED, call, odometry, poses_of, set_parameter
+from rclpy.qos import QoSProfile
 
-from l1slam_ros.core.running.keeper import updates, work
-from l1slam_ros.io.graphs.saved_map import is_map, load_map
+import l1slam_ros as l1
 
 DEADLINE = 60.0
 
 
 def keyframes(path):
-    return len(load_map(path)[0].optimised.poses) if path.exists() else 0
+    return l1.read_graph(path)[0].n_poses if path.exists() else 0
 
 
-def test_the_map_is_saved_while_it_grows_and_at_the_end(bench, tmp_path, monkeypatch):
+def test_the_map_is_saved_while_it_grows_and_at_the_end(bench, tmp_path):
     path = tmp_path / 'map.g2o'
     b = bench(save_path=str(path), autosave_period=0.2)
     b.drive(0, 3)
@@ -44,53 +41,29 @@ def test_the_map_is_saved_while_it_grows_and_at_the_end(bench, tmp_path, monkeyp
     b.drive(3, 5)
     b.until(lambda: keyframes(path) == 5, 'it is saved again')
     other = tmp_path / 'other.g2o'
-    assert b.backend.set_parameters([Parameter('save_path', value=str(other))])[0].successful
+    assert not set_parameter(b, 'save_path', str(other))
     assert call(b, 'save').message == f'5 keyframes saved to {other}'
     b.until(lambda: len(b.path().poses) == 5, 'the map')
     now = b.path()
-    assert b.backend.set_parameters([Parameter('autosave_period', value=1e6)])[0].successful
+    assert not set_parameter(b, 'autosave_period', 1e6)
     b.drive(5, 6)
     b.until(lambda: len(b.path().poses) == 6, 'a keyframe more')
-    assert b.backend.close(DEADLINE) and keyframes(other) == 6 and len(now.poses) == 5
-    b.peer.destroy_node()
+    assert b.close() and keyframes(other) == 6 and len(now.poses) == 5
 
 
-def test_the_map_is_saved_whatever_a_service_works_at(bench, tmp_path, monkeypatch):
-    path, optimise = tmp_path / 'map.g2o', updates.optimise
-    begun, finish = threading.Event(), threading.Event()
-
-    def slow(*arguments):
-        begun.set()
-        finish.wait(DEADLINE)
-        return optimise(*arguments)
-
-    monkeypatch.setattr(updates, 'optimise', slow)
-    b = bench(save_path=str(path), autosave_period=0.2)
-    b.drive(0, 3)
-    b.until(lambda: keyframes(path) == 3, 'the map is saved')
-    waiting = begin(b, 'optimize')
-    b.until(begun.is_set, 'it works')
-    b.drive(3, 5)
-    b.until(lambda: keyframes(path) == 5, 'the map is saved again')
-    finish.set()
-    b.until(waiting.done, 'optimize is answered')
-
-
-def test_a_settled_map_is_loaded_at_start_and_published_at_once(bench, tmp_path, monkeypatch):
+def test_a_settled_map_is_loaded_at_start_and_published_at_once(bench, tmp_path):
     path = tmp_path / 'map.g2o'
     first = bench(save_path=str(path))
     first.drive(0, 4)
     first.until(lambda: len(first.path().poses) == 4, 'a map')
-    first.until(lambda: first.backend._backend.behind().at_rest, 'it settles')
+    first.rest()
     assert call(first, 'save').success
-    improved = []
-    monkeypatch.setattr(work, 'improve', lambda *_: improved.append(1))
     second = bench(save_path=str(path), load_on_start=True)
     second.until(lambda: len(second.path().poses) == 4, 'the map is there without odometry')
     np.testing.assert_array_equal(poses_of(second.path()), poses_of(first.path()))
     second.received['/diagnostics'].clear()
     second.until(lambda: len(second.received['/diagnostics']) == 2, 'a second later')
-    assert not improved
+    assert second.count('updates') == 0 and len(second.received['path']) == 1
 
 
 def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, tmp_path, capfd):
@@ -98,8 +71,7 @@ def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, tmp_path, ca
     b = bench(save_path=str(path), autosave_period=0.2)
     said = f'save_path is {str(path)!r}, but there is no folder {path.parent}'
     assert said in capfd.readouterr().err
-    answer, = b.backend.set_parameters([Parameter('save_path', value=str(path))])
-    assert (answer.successful, answer.reason) == (False, said)
+    assert set_parameter(b, 'save_path', str(path)) == said
     b.drive(0, 3)
     b.until(lambda: b.status()[0] == DiagnosticStatus.ERROR
             and f'autosave failed: {path}: cannot be written: ' in b.status()[1], 'it says so')
@@ -151,8 +123,7 @@ class Robot:
         self.process = start('--ros-args', '-p', f'save_path:={path}', '-p',
                              'autosave_period:=0.2', '-p', 'load_on_start:=true')
         self.node, self.heard = ros.create_node('robot'), []
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(PathMessage, 'path', self.heard.append, latched)
+        self.node.create_subscription(PathMessage, 'path', self.heard.append, LATCHED)
         self.publisher = self.node.create_publisher(Odometry, 'odom', QoSProfile(depth=1000))
 
     def until(self, condition, what):
@@ -187,5 +158,7 @@ def test_a_killed_node_goes_on_where_it_was_and_a_signal_loses_nothing(ros, star
     np.testing.assert_allclose(poses_of(second.heard[-1])[:, 0], 5 + np.arange(20), atol=1e-6)
     said = second.end(signal.SIGTERM)
     assert second.process.returncode == 0 and '10 keyframes loaded from' in said, said
-    assert is_map(path) and keyframes(path) == 20
+    *lines, last = path.read_text().splitlines(keepends=True)
+    assert last.split() == ['#L1SLAM', 'sha256', sha256(''.join(lines).encode()).hexdigest()]
+    assert keyframes(path) == 20
     assert set(os.listdir(tmp_path)) == {'map.g2o', 'map.g2o.1'}

@@ -36,7 +36,7 @@ def kept_in(folder):
 def drive(b, first, last):
     """Drive, until there is a map."""
     b.drive(first, last)
-    b.until(lambda: b.backend._backend.counts()[0]['keyframes'] == last - first, 'a map')
+    b.until(lambda: b.count('keyframes') == last - first, 'a map')
 
 
 def files_of(folder):

@@ -20,10 +20,7 @@ from test_introspection import INPUTS, OUTPUTS, PARAMETERS, SERVICES
 
 rclpy = pytest.importorskip('rclpy')
 
-from l1slam_ros.core.errors import L1SlamError
-from l1slam_ros.ros.shell import domain
-from l1slam_ros.ros.shell.arguments import split
-from l1slam_ros.ros.shell.installed import executable
+from node_bench import executable
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 300.0  # [s] the solver can have to be compiled first
@@ -35,8 +32,6 @@ ODD = {
     'ROS_NAMESPACE': '/robot', 'FASTRTPS_DEFAULT_PROFILES_FILE': '/no/such.xml',
     'RCUTILS_LOGGING_USE_STDOUT': '1', 'RCUTILS_CONSOLE_OUTPUT_FORMAT': '{message}',
 }
-CHOOSE = ('from l1slam_ros.ros.shell.domain import go_where_nobody_is as go; '
-          'print(go(), flush=True); input()')
 STAND_IN = ('import os, rclpy; rclpy.init(); node = rclpy.create_node("other"); '
             'print("here", flush=True); input()')
 
@@ -61,45 +56,6 @@ def python():
     for process in processes:
         process.kill()
         process.communicate()
-
-
-def is_free(number):
-    mark = domain._take(number)
-    if mark is not None:
-        mark.close()
-    return mark is not None
-
-
-def test_who_choose_at_once_are_in_different_domains_until_they_end(python):
-    begun = [python(CHOOSE) for _ in range(4)]
-    chosen = {int(said) for _, said in begun}
-    assert len(chosen) == 4 and int(os.environ['ROS_DOMAIN_ID']) not in chosen
-    assert not any(is_free(number) for number in chosen)
-    for process, _ in begun:
-        process.kill()
-        process.wait()
-    assert all(is_free(number) for number in chosen)
-
-
-@pytest.mark.parametrize('told', [
-    {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'},
-    {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}, {'ROS_LOCALHOST_ONLY': '1'}])
-def test_a_domain_with_a_node_in_it_is_not_free(python, told):
-    process, said = python(CHOOSE)
-    process.kill()
-    process.wait()
-    number = int(said)
-    assert is_free(number)
-    python(STAND_IN, ROS_DOMAIN_ID=said, **told)
-    assert not is_free(number)
-
-
-def test_where_no_domain_is_free_it_is_said(monkeypatch):
-    before = os.environ['ROS_DOMAIN_ID']
-    monkeypatch.setattr(domain, '_DOMAINS', range(int(before), int(before) + 1))
-    with pytest.raises(L1SlamError, match='expected a free one'):
-        domain.go_where_nobody_is()
-    assert os.environ['ROS_DOMAIN_ID'] == before
 
 
 def test_a_middleware_that_is_not_there_is_said_and_another_used(start, tmp_path):
@@ -136,7 +92,7 @@ def test_the_demo_works_in_an_odd_shell_beside_another_node(python, tmp_path):
 
 def test_the_tests_work_in_an_odd_shell():
     """Two that read what processes say, and talk to them."""
-    tests = ROOT / 'test' / 'ros' / 'test_processes.py'
+    tests = ROOT / 'test' / 'node' / 'test_processes.py'
     ran = run(sys.executable, '-m', 'pytest', '-p', 'no:cacheprovider', tests, '-k',
               'a_map_comes_out or loses_neither', **ODD, ROS_DOMAIN_ID='7')
     assert ran.returncode == 0, ran.stdout + ran.stderr
@@ -164,6 +120,7 @@ def test_the_help_of_backend_lists_all_and_starts_nothing(ask):
     for name, (default, unit, _) in PARAMETERS.items():
         shown = str(default).lower() if isinstance(default, bool) else repr(default)
         assert f'\n  {name}: {shown}\n' in text and (f'[{unit}]' in text or not unit)
+    assert "\n  robots: ['']\n" in text  # a list as it is written
     assert max(map(len, text.splitlines())) <= 99
 
 
@@ -188,13 +145,3 @@ def test_replay_helps_and_refuses_what_it_does_not_know():
     helped = run(executable('replay'), '--help')
     assert helped.returncode == 0 and '--ros-args' in helped.stdout and '--rate' in helped.stdout
     assert run(executable('replay'), 'bag', '--frobnicate').returncode == 2
-
-
-@pytest.mark.parametrize('line, own', [
-    ('', ''), ('bag --remap a:=b', 'bag --remap a:=b'), ('--ros-args -r a:=b', ''),
-    ('--ros-args -r a:=b -- bag', 'bag'), ('bag --ros-args -r a:=b -- --clock --ros-args -p x:=1',
-                                           'bag --clock')])
-def test_a_command_line_is_split(line, own):
-    mine, of_ros = split(line.split())
-    assert mine == own.split()
-    assert sorted(mine + of_ros) == sorted(line.split())

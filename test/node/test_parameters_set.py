@@ -15,20 +15,9 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from node_bench import call
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
-
-from l1slam_ros.core.options import flatten
-from l1slam_ros.io.node_options import NodeOptions
-from l1slam_ros.ros.shell.arguments import help_of
-
-
-def put(b, name, value):
-    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-    (result,) = call(b, 'set_parameters', request, SetParameters).results
-    assert result.successful == (not result.reason)
-    return result.reason
+from node_bench import call, parameters_of
+from node_bench import set_parameter as put
+from rcl_interfaces.srv import DescribeParameters, ListParameters
 
 
 def test_a_shorter_period_of_the_updates_holds_at_once(bench):
@@ -60,23 +49,21 @@ def test_a_period_that_is_none_is_refused(bench, name, value):
 
 def test_what_is_read_at_start_only_is_refused_by_its_name(bench):
     b = bench()
-    fixed = {name: value for name, (value, meaning) in flatten(NodeOptions()).items()
-             if meaning.fixed}
+    names = call(b, 'list_parameters', kind=ListParameters).result.names
+    told = call(b, 'describe_parameters', DescribeParameters.Request(names=names),
+                DescribeParameters).descriptors
+    # What ROS declares is no matter of the page.
+    fixed = [one.name for one in told if one.read_only and not one.name.startswith('qos_overrides')
+             and one.name != 'start_type_description_service']
     page = (Path(__file__).parents[2] / 'doc' / 'topics_and_parameters.md').read_text()
     (named,) = re.findall('Read at start only are (.*?):', page, re.DOTALL)
     assert re.findall('`(.*?)`', named) == sorted(fixed)
-    for name, value in fixed.items():
-        value = list(value) if isinstance(value, tuple) else value
+    for name, value in zip(fixed, parameters_of(b, *fixed), strict=True):
         assert put(b, name, value) == f'Trying to set a read-only parameter: {name}.'
 
 
 def test_an_empty_list_of_robots_is_the_default(bench):
     """To ROS it has no type: it comes as no value at all."""
     b = bench(robots=[])
-    assert b.backend.options.robots == NodeOptions().robots
     b.drive(0, 2)
     b.until(lambda: len(b.path().poses) == 2, 'a single robot has its map')
-
-
-def test_help_shows_a_list_as_it_is_written():
-    assert "robots: ['']" in help_of('backend', NodeOptions())

@@ -15,14 +15,10 @@ pytest.importorskip('rclpy')
 
 from fixes import seen
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_bench import EVERY_MESSAGE, call, odometry, poses_of
+from node_bench import EVERY_MESSAGE, call, header, odometry, poses_of, stamp_of
+from worlds import compose, made, truth_of
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.running.snapshot import ACCEPTED
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.bags.from_graph import write_graph_bag
-from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.ros.shell.header import header
+import l1slam_ros as l1
 
 
 def fix(stamp, position, frame='map', variance=0.01):
@@ -34,36 +30,44 @@ def fix(stamp, position, frame='map', variance=0.01):
 
 def test_a_world_seen_by_gps_is_saved_and_goes_on(bench, tmp_path):
     rng = np.random.default_rng(5)
-    made = simulate_world(200, 300, WorldOptions(), rng)
-    world = seen(made.graph, made.truth, 10, rng, 0.1, sigma=0.2)
-    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(200)))
+    path = made(tmp_path / 'world.g2o', 200, 300, '--seed', 5)
+    graph, poses = l1.read_graph(path)
+    world = seen(graph, truth_of(path), 10, rng, 0.1, sigma=0.2)
+    l1.write_graph(tmp_path / 'bag', world.graph, poses)
     b = bench(save_path=str(tmp_path / 'map.g2o'), **EVERY_MESSAGE)
     b.play(tmp_path / 'bag')
     b.until(lambda: len(b.path().poses) == 200, 'all keyframes')
-    node = b.backend._backend
+    keyframes = [stamp_of(pose.header) for pose in b.path().poses]
 
     def refused():
-        now = node.snapshot()
-        states, factors = now.loop_states(), now.graph.between
-        return sorted(factors.j[states.rows[states.state != ACCEPTED]].tolist())
+        ends = {end for (_, end), (state, _) in b.loops().items() if state != 'accepted'}
+        return sorted(map(keyframes.index, ends))
 
-    b.until(lambda: refused() == world.false.tolist(), 'the false ones are refused, no others')
-    assert call(b, 'optimize').success and refused() == world.false.tolist()
-    assert world.error(node.poses) < 0.6
+    b.until(lambda: len(b.loops()) == 20 and refused() == world.false.tolist(),
+            'the false ones are refused, no others')
+    assert call(b, 'optimize').success
     b.until(lambda: world.error(poses_of(b.path())) < 0.6, 'the Path is in the world')
-    before = node.poses
-    assert call(b, 'save').success and call(b, 'reset').success and call(b, 'load').success
-    np.testing.assert_allclose(node.poses, before)
-    b.until(lambda: refused() == world.false.tolist(), 'they are judged anew')
+    assert refused() == world.false.tolist()
+    assert call(b, 'save').success and call(b, 'reset').success
+    b.until(lambda: not b.path().poses, 'the map is empty')
+    b.received['loop_status'].clear()
+    assert call(b, 'load').success
+    _, before = l1.read_graph(tmp_path / 'map.g2o')
+    b.until(lambda: b.path().poses, 'the map is back')
+    np.testing.assert_allclose(poses_of(b.path()), before, atol=1e-6)
+    b.until(lambda: len(b.loops()) == 20 and refused() == world.false.tolist(),
+            'they are judged anew')
     # The robot drives ten metres on, straight ahead, and GPS sees it there.
     last = before[-1]
     for k in range(12):
         b.send('/odom', odometry((2000 + k) * 10**9, 1.0 * k))
-    there = se2.compose(last[None], np.array([[11.0, 0.0, 0.0]]))[0]
+    there = compose(last, np.array([11.0, 0.0, 0.0]))
     b.send('/absolute_poses', fix(2011 * 10**9, there[:2].tolist()))
-    b.until(lambda: len(node.loop_states().state) == 21 and node.loop_states().state[-1]
-            == ACCEPTED, 'the new one is believed')
-    assert np.hypot(*(node.poses[-1] - there)[:2]) < 1.0
+    b.until(lambda: [state for (_, end), (state, _) in b.loops().items() if end == 2011 * 10**9]
+            == ['accepted'], 'the new one is believed')
+    assert len(b.loops()) == 21
+    b.until(lambda: stamp_of(b.path().poses[-1].header) == 2011 * 10**9 and np.hypot(
+        *(poses_of(b.path())[-1] - there)[:2]) < 1.0, 'the Path is there')
 
 
 def test_what_is_not_of_the_map_frame_or_says_nothing_is_counted(bench):

@@ -15,46 +15,47 @@ pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from node_bench import EVERY_MESSAGE, call, loop, odometry, poses_of
-from team import Team, believed_by
+from node_bench import EVERY_MESSAGE, call, header, loop, odometry, poses_of, put
+from team import Team
+from worlds import between
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.io.messages.conversion import reference_frame_id
-from l1slam_ros.ros.shell.header import header
+import l1slam_ros as l1
 
 NAMES = [f'r{k}' for k in range(1, 6)]
 
 
 def message_of(found):
     """Return topic and message of a sample or a loop."""
-    if isinstance(found, LoopClosure):
+    if isinstance(found, l1.LoopClosure):
         one, other = (NAMES[robot] for robot in found.robots)
-        frame = reference_frame_id(f'{one}/base_link', found.reference_stamp)
+        frame = '{}/base_link@{}.{:09d}'.format(one, *divmod(found.reference_stamp, 10**9))
         topic, message = f'/{other}/loop_closures', PoseWithCovarianceStamped(
             header=header(frame, found.stamp))
     else:
         topic, message = '', Odometry(header=header('odom', found.stamp),
                                       child_frame_id='base_link')
-    pose = message.pose.pose
-    (pose.position.x, pose.position.y, _, _, _, pose.orientation.z,
-     pose.orientation.w) = found.pose3.tolist()
+    put(message.pose.pose, found.pose3[:3], found.pose3[3:])
     message.pose.covariance = found.covariance.ravel()
     return topic, message
 
 
-def play(b, team, late=0, between=True):
+def play(b, team, late=0, joined=True):
     """Send all that robots say, as fast as it is used."""
-    sent, traffic = 0, b.backend._inputs.traffic
+    sent, unheard = 0, 0
     for robot, found in team.messages(late):
         topic, message = message_of(found)
-        if not topic or between or len(set(found.robots)) == 1:
+        if not topic or joined or len(set(found.robots)) == 1:
             b.send(topic or f'/{NAMES[robot]}/odom', message)
             sent += 1
-        if sent % 40 == 0:
-            b.until(lambda n=sent: sum(t.received for t in traffic.values()) >= n, 'it is used')
-    b.until(lambda: sum(t.received for t in traffic.values()) == sent, 'all is used')
-    b.until(lambda: b.backend._backend.behind().loops == 0, 'all is judged')
+            unheard += 1
+        if not topic and unheard >= 40:
+            b.until(lambda name=f'{NAMES[robot]}/', last=found.stamp: b.newest(name) >= last,
+                    'it is used')
+            unheard = 0
+    b.until(lambda: sum(int(value) for key, value in b.status()[2].items()
+                        if key.endswith('.received')) == sent, 'all is used')
+    b.anew()
+    b.until(lambda: b.status()[2]['behind.loops'] == '0', 'all is judged')
 
 
 def lines(b):
@@ -65,8 +66,8 @@ def lines(b):
 
 
 def settled(b, joined):
-    b.until(lambda: call(b, 'optimize') and b.backend._backend.robot(1).joined == joined,
-            'the map is done')
+    call(b, 'optimize')
+    b.until(lambda: lines(b)['r2'][1]['joined'] == str(joined), 'the map is done')
     b.until(lambda: b.received['r2/path'] and b.received['r2/path'][-1].header.frame_id == (
         'map' if joined else 'r2/map'), 'the path of the second robot is in its map')
 
@@ -78,28 +79,31 @@ def test_robots_with_lies_between_them_have_the_loops_of_the_batch(bench, robots
     b = bench(robots=NAMES[:robots], **EVERY_MESSAGE)
     play(b, team, late)
     settled(b, True)
-    expected, found = team.believed(), believed_by(b.backend._backend.snapshot())
+    b.anew()
+    expected = {(NAMES[one], NAMES[other], *ends) for one, other, *ends in team.believed()}
+    found = {ends for ends, (state, _) in b.loops().items() if state == 'accepted'}
     assert len(expected) > 150 and len(expected ^ found) <= 0.01 * len(expected)
     for robot, name in enumerate(NAMES[:robots]):
-        assert b.backend._backend.robot(robot).joined
+        assert lines(b)[name][1]['joined'] == 'True'
         path = b.received[f'{name}/path'][-1]
         b.until(lambda name=name: len(b.received[f'{name}/path'][-1].poses) == share, 'all of it')
-        truth = se2.between(np.tile(team.truth[:1], (share, 1)), team.truth[team.robot == robot])
+        truth = between(team.truth[0], team.truth[team.robot == robot])
         path = b.received[f'{name}/path'][-1]
         assert path.header.frame_id == 'map'
         assert np.abs(poses_of(path) - truth)[:, :2].max() < 0.7
         heard = b.received[f'{name}/map_to_odom']
         b.until(lambda heard=heard: heard[-1].header.frame_id == 'map', 'it is in the map')
         assert {message.child_frame_id for message in heard} == {f'{name}/odom'}
-    assert not b.backend._inputs.refused
+    b.anew()
+    assert not b.refused()
 
 
 def test_a_robot_that_nothing_joins_is_published_in_its_own_map(bench):
     team, b = Team(n=120, edges=400, lies=0), bench(robots=NAMES[:2], **EVERY_MESSAGE)
-    play(b, team, between=False)
+    play(b, team, joined=False)
     settled(b, False)
     b.until(lambda: len(b.received['r2/path'][-1].poses) == 60, 'all of it')
-    truth = se2.between(np.tile(team.truth[60:61], (60, 1)), team.truth[60:])
+    truth = between(team.truth[60], team.truth[60:])
     b.until(lambda: np.abs(poses_of(b.received['r2/path'][-1]) - truth)[:, :2].max() < 0.5,
             'its loops have made its map')
     assert {p.header.frame_id for p in b.received['r2/pose']} == {'r2/map'}
@@ -118,7 +122,7 @@ def test_a_map_of_two_robots_is_loaded_by_their_names(bench, tmp_path):
     play(b, team)
     settled(b, True)
     b.until(lambda: len(b.received['r2/path'][-1].poses) == 60, 'all of it')
-    b.until(lambda: b.backend._backend.update(0.0) is None, 'the map stands still')
+    b.rest()
     assert call(b, 'save').success
     second = poses_of(b.received['r2/path'][-1])
     b.close()
@@ -126,9 +130,8 @@ def test_a_map_of_two_robots_is_loaded_by_their_names(bench, tmp_path):
     b.until(lambda: b.received['r2/path'] and len(b.received['r2/path'][-1].poses) == 60,
             'the map is back')
     # The second one is the first now: its frame is that of the map.
-    first = np.tile(second[:1], (60, 1))
-    np.testing.assert_allclose(poses_of(b.received['r2/path'][-1]),
-                               se2.between(first, second), atol=1e-6)
+    np.testing.assert_allclose(poses_of(b.received['r2/path'][-1]), between(second[0], second),
+                               atol=1e-6)
     # It goes on, from elsewhere: a new part of the same robot.
     for k in range(3):
         b.send('/r2/odom', odometry((1000 + k) * 10**9, 1.0 * k))
@@ -141,7 +144,7 @@ def test_a_loop_of_a_robot_that_nobody_named_is_counted_and_said_once(bench, cap
     b.send('/r1/odom', odometry(10**9, 0.0))
     for k in range(3):
         b.send('/r1/loop_closures', loop((5 + k) * 10**9, frame=f'r9/base_link@{k + 1}.000000000'))
-    b.until(lambda: b.backend._inputs.refused['robot'] == 3, 'they are counted')
+    b.until(lambda: b.count('refused.robot') == 3, 'they are counted')
     said = [line for line in capfd.readouterr().err.splitlines() if 'r9/' in line]
     assert len(said) == 1 and 'expected one of r1, r2' in said[0]
 
@@ -151,10 +154,9 @@ def test_of_many_robots_that_nobody_named_the_first_are_said_and_all_counted(ben
     b.send('/r1/odom', odometry(10**9, 0.0))
     for k in range(60):
         b.send('/r1/loop_closures', loop(5 * 10**9, frame=f'x{k}/base_link@1.000000000'))
-    b.until(lambda: b.backend._inputs.refused['robot'] == 60, 'they are counted')
+    b.until(lambda: b.count('refused.robot') == 60, 'they are counted')
     said = [line for line in capfd.readouterr().err.splitlines() if 'refused:' in line]
     assert len(said) == 21 and 'more than 20 other robots' in said[-1]
-    assert len(b.backend._inputs._strangers) == 21
 
 
 def test_frames_may_have_the_name_of_the_robot_or_not(bench):
@@ -166,8 +168,6 @@ def test_frames_may_have_the_name_of_the_robot_or_not(bench):
     b.send('/r2/loop_closures', loop(4 * 10**9, frame='base_link@1.000000000', variance=.01))
     # Between two robots the reference may be later: clocks differ.
     b.send('/r2/loop_closures', loop(2 * 10**9, frame='r1/base_link@4.000000000', variance=.01))
-    counted = b.backend._backend.counts
-    b.until(lambda: sum(counts for name, counts in counted().sizes.items()
-                        if name in ('accepted_loops', 'suspect_loops', 'rejected_loops')) == 3,
-            'all three are loops')
-    assert not b.backend._inputs.refused
+    b.until(lambda: sum(b.count(f'{state}_loops') for state in (
+        'accepted', 'suspect', 'rejected')) == 3, 'all three are loops')
+    assert not b.refused()

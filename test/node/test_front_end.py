@@ -17,10 +17,8 @@ from headers import without_header
 
 pytest.importorskip('rclpy')
 
-from node_bench import odometry, poses_of
+from node_bench import header, odometry, poses_of
 from sensor_msgs.msg import LaserScan
-
-from l1slam_ros.ros.shell.header import header
 
 EXAMPLE = Path(__file__).parents[2] / 'config' / 'front_end.py'
 RAYS = 360
@@ -49,10 +47,8 @@ def test_the_example_closes_a_loop_when_the_robot_is_back(bench):
             b.send('/odom', odometry(stamp - step * 10**9, x - 0.1 * step))
         b.send('/odom', odometry(stamp, x))
         scans.publish(scan(stamp, np.pi / 6 if k == 4 else 0.0, x if k < 4 else 0.0))
-    b.until(lambda: len(b.backend._backend.loop_states().rows) == 2,
-            'both loops are in the graph')
-    state = b.backend._backend.loop_states()
-    assert state.stamps.tolist() == [[7 * 10**9, 19 * 10**9], [10**9, 25 * 10**9]]
+    b.until(lambda: b.states()['accepted'] == 2, 'both loops are in the graph')
+    assert [*b.loops()] == [(7 * 10**9, 19 * 10**9), (10**9, 25 * 10**9)]
     b.until(lambda: len(b.path().poses) and np.allclose(
         poses_of(b.path())[-1], [0, 0, np.pi / 6], atol=0.05), 'the map knows where it ends')
     b.executor.remove_node(front_end)

@@ -13,32 +13,27 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
-from node_bench import EVERY_MESSAGE, call, poses_of
+from node_bench import EVERY_MESSAGE, call, header, poses_of
 from rosgraph_msgs.msg import Clock
 
 import l1slam_ros as l1
-from bags import write_world
-from l1slam_ros.io.bags.reader import read_raw
-from l1slam_ros.ros.shell.header import header
+from bags import recording_of, write_world
 
 N = 120
-KINDS = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped}
 
 
 def test_a_bag_played_twice_by_a_clock_that_stands_is_the_map_and_the_odometry(bench, tmp_path):
     graph = write_world(tmp_path / 'bag', N, 240, 3).graph
-    messages = list(read_raw(tmp_path / 'bag', KINDS))
+    messages = recording_of(tmp_path / 'bag')
     b = bench(use_sim_time=True, **EVERY_MESSAGE)
     clock = b.peer.create_publisher(Clock, '/clock', 10)
     b.until(clock.get_subscription_count, 'the node hears the clock')
     once = l1.solve(graph).poses
     for turn in 1, 2:
-        for number, message in enumerate(messages):
+        for number, (topic, _, time, data) in enumerate(messages):
             if not len(messages) / 3 < number < len(messages) / 2:
-                clock.publish(Clock(clock=header('', message.time).stamp))
-            b.send(message.topic, message.data)
+                clock.publish(Clock(clock=header('', time).stamp))
+            b.send(topic, data)
         b.until(lambda turn=turn: b.status()[2].get('keyframes') == str(turn * N), 'all is in')
         answer = call(b, 'optimize')  # no loop joins the second part to the first
         assert (answer.success, ' joins 2 parts of ' in answer.message) == (turn == 1, turn == 2)

@@ -9,6 +9,7 @@
 """What `ros2 node info`, `ros2 param describe` and `ros2 lifecycle` show: the node's interface."""
 
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -20,14 +21,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
-from node_bench import call, odometry
+from node_bench import call, executable, odometry, parameters_of
 from rcl_interfaces.srv import DescribeParameters, ListParameters
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy, qos_profile_sensor_data
 from rosbags.typesys import Stores, get_typestore
 
-from l1slam_ros.io.graphs.saved_map import load_map
-from l1slam_ros.ros.scans.options import ScanLoopsOptions
-from l1slam_ros.ros.shell.arguments import help_of
+import l1slam_ros as l1
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / 'config'
@@ -91,9 +90,9 @@ def test_topics_and_services_are_those_of_the_interface(bench):
     for topic in INPUTS:
         (end,) = b.peer.get_subscriptions_info_by_topic(topic)
         assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
-        assert b.backend.has_parameter(f'qos_overrides.{topic}.subscription.reliability')
-        assert b.backend.has_parameter(f'qos_overrides.{topic}.subscription.depth')
-        assert b.backend.get_parameter(f'qos_overrides.{topic}.subscription.depth').value == 1000
+        override = f'qos_overrides.{topic}.subscription'
+        assert parameters_of(b, f'{override}.reliability', f'{override}.depth') == [
+            'reliable', 1000]
     for topic in OUTPUTS:
         (end,) = b.peer.get_publishers_info_by_topic(topic)
         latched = end.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
@@ -123,8 +122,8 @@ def test_parameters_are_described_with_unit_and_range(bench):
                  'use_sim_time', 'start_type_description_service')]
     answer = call(b, 'describe_parameters', DescribeParameters.Request(names=names),
                   DescribeParameters)
-    for name, described in zip(names, answer.descriptors, strict=True):
-        value = b.backend.get_parameter(name).value
+    for name, value, described in zip(names, parameters_of(b, *names), answer.descriptors,
+                                      strict=True):
         assert described.description, name
         if isinstance(value, float):
             assert len(described.floating_point_range) == 1, name
@@ -176,7 +175,8 @@ def test_rviz_displays_each_topic_as_what_it_is():
 
 def test_the_layouts_show_what_scan_loops_hears_and_says():
     """Its topics, with their types. A laser publishes with best effort, as a rule."""
-    help_text = help_of('scan_loops', ScanLoopsOptions())
+    help_text = subprocess.run([executable('scan_loops'), '--help'], capture_output=True,
+                               text=True).stdout
     for topic, kind in SCANS.items():
         assert f'{topic.removeprefix("/")} ({kind.replace("/msg/", "/")})' in help_text
     (scan,) = (one for one in rviz()['Displays'] if one.get('Name') == 'Scan')
@@ -238,7 +238,7 @@ def test_a_node_that_is_managed_does_as_it_is_told(bench, tmp_path):
     assert change(b, Transition.TRANSITION_CLEANUP) and state(b) == 'unconfigured'
     b.until(lambda: not b.path().poses, 'the map is empty')
     b.until(path.exists, 'it is saved; the next autosave would be a minute later')
-    assert load_map(path)[1] == f'2 keyframes loaded from {path}'
+    assert l1.read_graph(path)[0].n_poses == 2
     assert change(b, Transition.TRANSITION_CONFIGURE) and change(b, Transition.TRANSITION_ACTIVATE)
     assert change(b, Transition.TRANSITION_ACTIVE_SHUTDOWN) and state(b) == 'finalized'
     b.drive(4, 5)

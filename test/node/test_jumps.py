@@ -1,0 +1,70 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""What the node does and says where a clock or its own map jumps."""
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from node_bench import loop, poses_of
+from rosgraph_msgs.msg import Clock
+
+import l1slam_ros as l1
+
+
+@pytest.mark.parametrize('choice', ['new_segment', 'reset', 'ignore'])
+def test_when_the_clock_jumps_back(bench, tmp_path, choice):
+    b = bench(use_sim_time=True, on_time_jump=choice, save_path=str(tmp_path / 'map.g2o'))
+    publisher = b.peer.create_publisher(Clock, '/clock', 10)
+    b.until(publisher.get_subscription_count, 'the node looks at the clock')
+
+    def tell(seconds):
+        message = Clock()
+        message.clock.sec = seconds
+        publisher.publish(message)
+        b.until(lambda: b.received['/diagnostics'] and b.received['/diagnostics'][
+            -1].header.stamp.sec == seconds, f'it is {seconds}')
+
+    tell(100)
+    b.drive(0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map, though the clock stands still')
+    tell(101)
+    tell(50)
+    for _ in range(2 if choice == 'new_segment' else 0):
+        b.received['map_to_odom'].clear()
+        count = len(b.received['/diagnostics'])
+        b.until(lambda n=count: len(b.received['/diagnostics']) > n, 'a second has passed')
+        # A transform of the time before would make tf2 ignore what comes.
+        quiet = not b.received['map_to_odom']
+    assert choice != 'new_segment' or quiet
+    if choice == 'reset':
+        b.until(lambda: len(b.path().poses) == 0, 'the map begins anew')
+        b.until((tmp_path / 'map.g2o').exists, 'what was is saved')
+        assert l1.read_graph(tmp_path / 'map.g2o')[0].n_poses == 3
+        b.drive(0, 2)
+    else:
+        b.drive(*((3, 5) if choice == 'ignore' else (0, 2)))
+    # A part that begins where the last one ends begins with a keyframe there.
+    expected, end = {'new_segment': (5, 3.0), 'reset': (2, 1.0), 'ignore': (5, 4.0)}[choice]
+    b.until(lambda: len(b.path().poses) == expected, f'the map has {expected} keyframes')
+    assert poses_of(b.path())[-1, 0] == pytest.approx(end)
+
+
+def test_the_jump_of_the_transform_is_said(bench):
+    """A trusted loop says that the robot came but 4 m in what odometry says were 5.
+
+    The front takes the most of that step at once, the map behind it the rest.
+    """
+    b = bench()
+    b.drive(0, 6)
+    b.until(lambda: len(b.path().poses) == 6, 'a map')
+    b.send('/trusted_loop_closures', loop(6 * 10**9, 4.0, variance=1e-8))
+    b.until(lambda: 0.01 < float(b.status()[2].get('jump.translation', 0)) < 1.01, 'a jump')
+    b.until(lambda: b.path().poses[-1].pose.position.x == pytest.approx(4.0, abs=0.01),
+            'a metre in all')
