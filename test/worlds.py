@@ -1,0 +1,114 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""Worlds as files, made by `l1slam simulate` or by NumPy."""
+
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+
+from l1slam_ros.cli.main import main
+
+
+def made(path, poses, edges, *more):
+    """Simulate a world at a path, without a word; return the path."""
+    with redirect_stdout(StringIO()):
+        assert main(['simulate', str(path), '--poses', str(poses), '--edges', str(edges),
+                     *map(str, more)]) == 0
+    return path
+
+
+def graph_file(folder, lines):
+    """Write a graph of these lines; return its path."""
+    path = folder / 'graph.g2o'
+    path.write_text('\n'.join(lines) + '\n')
+    return path
+
+
+def truth_of(path):
+    """Return the true poses of a world in the plane, (n, 3)."""
+    return np.loadtxt(f'{path}.truth.txt')[:, 1:]
+
+
+def false_of(path):
+    """Return the ids of the false loops of a world, a list of pairs."""
+    return np.loadtxt(f'{path}.false.txt', dtype=int, ndmin=2).tolist()
+
+
+def lines_of(path, tag):
+    """Return the fields behind the first words of the lines that begin so, as strings."""
+    rows = [line.split() for line in Path(path).read_text().splitlines()]
+    return [row[1:] for row in rows if row and row[0].startswith(tag)]
+
+
+def pairs_of(path):
+    """Return the ids of the edges of a g2o file, a list of pairs in its order."""
+    return [[int(row[0]), int(row[1])] for row in lines_of(path, 'EDGE_SE')]
+
+
+def compose(a, b):
+    """Return a b of poses x, y, theta, (n, 3)."""
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack((a[..., 0] + cos * b[..., 0] - sin * b[..., 1],
+                     a[..., 1] + sin * b[..., 0] + cos * b[..., 1],
+                     wrapped(a[..., 2] + b[..., 2])), axis=-1)
+
+
+def between(a, b):
+    """Return a^-1 b of poses x, y, theta, (n, 3)."""
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x, y = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
+    return np.stack((cos * x + sin * y, cos * y - sin * x, wrapped(b[..., 2] - a[..., 2])),
+                    axis=-1)
+
+
+def wrapped(angle):
+    """Return angles in [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def whitened(graph, poses):
+    """Return the whitened residuals (m, 3) of a graph in the plane at poses (n, 3)."""
+    factors, poses = graph.between, np.vstack((poses, np.zeros(3)))  # the last is of the world
+    error = between(factors.measurement, between(poses[factors.i], poses[factors.j]))
+    return np.einsum('mij,mj->mi', factors.sqrt_information, error)
+
+
+def edge(i, j, measurement, information):
+    """Return a line of g2o; information : (3, 3)."""
+    numbers = *measurement, *np.asarray(information, float)[np.triu_indices(3)]
+    return f'EDGE_SE2 {i} {j} ' + ' '.join(repr(float(number)) for number in numbers)
+
+
+def torn(path):
+    """
+    Write a drive whose refused loops agree on another map; return the ids where these end.
+
+    Its halves are joined by 72 loops, all in runs that are off by the same; ids begin with 100.
+    """
+    made(path, 400, 609)
+    truth, half, first, run = truth_of(path), 200, 100, np.arange(8)
+    edges = []
+    for i, j, *numbers in lines_of(path, 'EDGE_SE2'):
+        i, j, measurement = int(i), int(j), np.array(numbers[:3], float)
+        information = np.diag(np.array(numbers, float)[[3, 6, 8]])
+        if j == i + 1:  # with half of the noise of rotations
+            turn = truth[j, 2] - truth[i, 2]
+            measurement[2] = turn + wrapped(measurement[2] - turn) / 2
+            information[2, 2] *= 4
+        if j == i + 1 or (i < half) == (j < half):
+            edges.append(edge(first + i, first + j, measurement, information))
+    for start in range(9):
+        i, j = 5 + 20 * start + run, 210 + 20 * start + run
+        off = between(truth[i], compose(np.array([8.0, -6.0, 0.4]), truth[j]))
+        edges += [edge(first + i[k], first + j[k], off[k], np.diag([400.0, 400.0, 1e4]))
+                  for k in run]
+    Path(path).write_text('\n'.join(edges) + '\n')
+    return np.array([105, 478])
