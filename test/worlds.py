@@ -53,6 +53,18 @@ def pairs_of(path):
     return [[int(row[0]), int(row[1])] for row in lines_of(path, 'EDGE_SE')]
 
 
+def edges_of(path):
+    """Return i, j, measurement (3,) and information (3, 3) of each edge in the plane."""
+    edges = []
+    for i, j, *numbers in lines_of(path, 'EDGE_SE2'):
+        measurement, upper = np.split(np.array(numbers, float), [3])
+        information = np.zeros((3, 3))
+        information[np.triu_indices(3)] = upper
+        edges.append((int(i), int(j), measurement,
+                      information + np.triu(information, 1).T))
+    return edges
+
+
 def compose(a, b):
     """Return a b of poses x, y, theta, (n, 3)."""
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
@@ -96,9 +108,7 @@ def torn(path):
     made(path, 400, 609)
     truth, half, first, run = truth_of(path), 200, 100, np.arange(8)
     edges = []
-    for i, j, *numbers in lines_of(path, 'EDGE_SE2'):
-        i, j, measurement = int(i), int(j), np.array(numbers[:3], float)
-        information = np.diag(np.array(numbers, float)[[3, 6, 8]])
+    for i, j, measurement, information in edges_of(path):
         if j == i + 1:  # with half of the noise of rotations
             turn = truth[j, 2] - truth[i, 2]
             measurement[2] = turn + wrapped(measurement[2] - turn) / 2
