@@ -9,6 +9,9 @@
 """`l1slam` in this process."""
 
 import json
+import re
+
+import pytest
 
 from l1slam_ros.cli.main import main
 
@@ -25,3 +28,16 @@ def run(capsys, *arguments, code=0):
 def solve_json(capsys, *arguments, code=0):
     """Return what `l1slam solve --json` says, which must end with a code."""
     return json.loads(run(capsys, 'solve', *arguments, '--json', code=code)[0])
+
+
+def help_of(capsys, *arguments):
+    """Return what a command says of itself."""
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, '--help'])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+def texts_of(path):
+    """Return the texts of an SVG: matplotlib draws outlines, and notes them in comments."""
+    return re.findall(r'<!-- (.*?) -->', path.read_text())

@@ -19,14 +19,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from command import solve_json
-from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin
 
 import l1slam_ros as l1
-from bags import NOTE
+from bags import recording_of, rosbag2_directory
 from l1slam_ros.cli.main import main
-from l1slam_ros.io.bags.writer import new_bag
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / 'README.md').read_text()
@@ -200,12 +198,9 @@ def test_what_is_of_another_kind_is_refused_by_its_name(world, call, said):
 
 def test_a_bag_of_another_robot_is_read_by_its_topics(world, tmp_path):
     main(['convert', str(world), str(tmp_path / 'bag')])
-    with AnyReader([tmp_path / 'bag']) as reader, new_bag(
-            tmp_path / 'other', yaml.safe_load(NOTE)) as writer:
-        for connection in reader.connections:
-            writer.add_topic(f'/r1{connection.topic}', connection.msgtype)
-        for connection, time, data in reader.messages():
-            writer.write(f'/r1{connection.topic}', time, bytes(data))
+    rosbag2_directory(tmp_path / 'other', [
+        (f'/r1{topic}', *rest) for topic, *rest in recording_of(tmp_path / 'bag')],
+        StoragePlugin.MCAP)
     graph, _ = l1.read_graph(tmp_path / 'other', odom_topic='/r1/odom',
                              loop_topic='/r1/loop_closures')
     expected, _ = l1.read_graph(tmp_path / 'bag')

@@ -25,9 +25,44 @@ def made(path, poses, edges, *more):
     return path
 
 
+def graph_file(folder, lines):
+    """Write a graph of these lines; return its path."""
+    path = folder / 'graph.g2o'
+    path.write_text('\n'.join(lines) + '\n')
+    return path
+
+
 def truth_of(path):
     """Return the true poses of a world in the plane, (n, 3)."""
     return np.loadtxt(f'{path}.truth.txt')[:, 1:]
+
+
+def false_of(path):
+    """Return the ids of the false loops of a world, a list of pairs."""
+    return np.loadtxt(f'{path}.false.txt', dtype=int, ndmin=2).tolist()
+
+
+def lines_of(path, tag):
+    """Return the fields behind the first words of the lines that begin so, as strings."""
+    rows = [line.split() for line in Path(path).read_text().splitlines()]
+    return [row[1:] for row in rows if row and row[0].startswith(tag)]
+
+
+def pairs_of(path):
+    """Return the ids of the edges of a g2o file, a list of pairs in its order."""
+    return [[int(row[0]), int(row[1])] for row in lines_of(path, 'EDGE_SE')]
+
+
+def edges_of(path):
+    """Return i, j, measurement (3,) and information (3, 3) of each edge in the plane."""
+    edges = []
+    for i, j, *numbers in lines_of(path, 'EDGE_SE2'):
+        measurement, upper = np.split(np.array(numbers, float), [3])
+        information = np.zeros((3, 3))
+        information[np.triu_indices(3)] = upper
+        edges.append((int(i), int(j), measurement,
+                      information + np.triu(information, 1).T))
+    return edges
 
 
 def compose(a, b):
@@ -64,24 +99,6 @@ def position_error(found, truth):
     U, _, Vt = np.linalg.svd(a.T @ b)
     U[:, -1] *= np.sign(np.linalg.det(U @ Vt))
     return float(np.sqrt(((a @ (U @ Vt) - b)**2).sum(axis=1).mean()))
-
-
-def lines_of(path, tag):
-    """Return the fields behind the first words of the lines that begin so, as strings."""
-    rows = [line.split() for line in Path(path).read_text().splitlines()]
-    return [row[1:] for row in rows if row and row[0].startswith(tag)]
-
-
-def edges_of(path):
-    """Return i, j, measurement (3,) and information (3, 3) of each edge in the plane."""
-    edges = []
-    for i, j, *numbers in lines_of(path, 'EDGE_SE2'):
-        measurement, upper = np.split(np.array(numbers, float), [3])
-        information = np.zeros((3, 3))
-        information[np.triu_indices(3)] = upper
-        edges.append((int(i), int(j), measurement,
-                      information + np.triu(information, 1).T))
-    return edges
 
 
 def edge(i, j, measurement, information):

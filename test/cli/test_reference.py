@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Truth at the times of keyframes: between true poses, never beyond them, and not across gaps."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,41 +16,49 @@ import pytest
 from command import run, solve_json
 from messages import TYPES, header, numbers, odometry, of_rosbags, pose, pose_with_covariance
 from rosbags.rosbag2 import StoragePlugin
+from worlds import between, compose, edge, wrapped
 
 from bags import rosbag2_directory
-from l1slam_ros.cli.reference import position_error, read_truth, true_path
-from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.alignment import poses_at
-from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.trajectory import write_tum
 
 SECOND = 10**9
 
 
-def test_nothing_is_extrapolated_nor_bridged():
-    times, poses = np.array([10, 20, 30, 90, 100]), np.arange(15.0).reshape(5, 3) / 10
-    at = np.array([8, 9, 10, 25, 30, 31, 32, 60, 88, 89, 90, 95, 100, 101, 102])
-    rows, found = poses_at(se2, times, poses, at, 20, 1)
-    assert at[rows].tolist() == [9, 10, 25, 30, 31, 89, 90, 95, 100, 101]
-    # What lies beyond the end by rounding alone is at the end.
-    np.testing.assert_allclose(found[[0, -1]], poses[[0, -1]], atol=1e-12)
+def drive(path, stamps, moved=(0.0, 0.0, 0.0), away=()):
+    """
+    Write a drive along a circle as a graph, with its stamps [ns]; return the path.
 
-
-def drive(stamps):
-    """Return a record of a drive along a circle, and its poses (n, 3) at stamps [ns]."""
+    moved : the pose that the map is moved by; away : rows that are besides far from their places
+    """
     poses = true_at(stamps)
-    graph, k = FactorGraph(se2), np.arange(len(stamps) - 1)
-    graph.add_poses(len(stamps))
-    graph.add_between(k, k + 1, se2.between(poses[:-1], poses[1:]),
-                      np.tile(np.eye(3), (len(k), 1, 1)))
-    return GraphRecord(graph, poses, 7 + 2 * np.arange(len(stamps)), stamps), poses
+    steps, ids = between(poses[:-1], poses[1:]), 7 + 2 * np.arange(len(stamps))
+    poses = compose(np.array(moved), poses)
+    poses[away, 0] += 100.0
+    path.write_text('\n'.join([
+        *(f'VERTEX_SE2 {k} {x} {y} {theta}' for k, (x, y, theta) in zip(ids, poses, strict=True)),
+        *(edge(k, k + 2, step, np.eye(3)) for k, step in zip(ids, steps, strict=False))]))
+    Path(f'{path}.stamps.txt').write_text(''.join(
+        f'{k} {stamp // SECOND}.{stamp % SECOND:09}\n'
+        for k, stamp in zip(ids, stamps, strict=True)))
+    return path
 
 
 def true_at(stamps):
     angle = 0.05 * (np.asarray(stamps) - 100 * SECOND) / SECOND
-    return np.stack((20 * np.sin(angle), -20 * np.cos(angle), se2.wrap(angle)), axis=1)
+    return np.stack((20 * np.sin(angle), -20 * np.cos(angle), wrapped(angle)), axis=1)
+
+
+def write_truth(path, stamps):
+    """Write the true poses at some stamps [ns] as TUM."""
+    path.write_text(''.join(
+        f'{stamp // SECOND}.{stamp % SECOND:09} {x} {y} 0 0 0 {np.sin(t / 2)} {np.cos(t / 2)}\n'
+        for stamp, (x, y, t) in zip(stamps, true_at(stamps), strict=True)))
+    return path
+
+
+def compared(capsys, graph, truth, *more):
+    """Return what is said of a map as it stands, and of its truth."""
+    return solve_json(capsys, graph, '--no-robust', '--start', 'file', '--outer', 0,
+                      '--reference', truth, *more)
 
 
 # Keyframes that fall in between the true poses, which begin later, end earlier and have a hole.
@@ -61,28 +70,45 @@ SCORED = (((BEFORE[0] <= KEYFRAMES) & (BEFORE[-1] >= KEYFRAMES))
           | ((AFTER[0] <= KEYFRAMES) & (AFTER[-1] >= KEYFRAMES)))
 
 
-def test_truth_is_interpolated_at_the_stamps_of_the_poses(tmp_path):
-    record, poses = drive(KEYFRAMES)
-    write_tum(tmp_path / 'truth.tum', TRUE, true_at(TRUE), se2)
-    truth = read_truth(str(tmp_path / 'truth.tum'), record, Path('graph.g2o'))
-    assert truth.rows.tolist() == np.flatnonzero(SCORED).tolist() and 30 < len(truth.rows) < 60
+def strokes_of(picture):
+    """Return the long lines of an SVG, each the strokes (k, 2) it is of."""
+    lines = [[np.array(re.findall(r'-?[0-9.]+', stroke), float).reshape(-1, 2)
+              for stroke in line.split('M')[1:]]
+             for line in re.findall(r'<path d="([ML0-9. \n-]+)"', picture.read_text())]
+    return [line for line in lines if sum(map(len, line)) > 20]
+
+
+def circle_through(points):
+    """Return the centre and the radius of the circle that fits points (n, 2)."""
+    x, y, c = np.linalg.lstsq(np.column_stack((2 * points, np.ones(len(points)))),
+                              (points**2).sum(axis=1))[0]
+    return np.array([x, y, np.sqrt(c + x * x + y * y)])
+
+
+def test_truth_is_interpolated_at_the_stamps_of_the_poses(capsys, tmp_path):
+    graph = drive(tmp_path / 'graph.g2o', KEYFRAMES)
+    truth = write_truth(tmp_path / 'truth.tum', TRUE)
+    report = compared(capsys, graph, truth)
+    assert 30 < report['ate_poses'] < 60
     # A chord of a quarter of a metre; the nearest true pose is up to an eighth of one off.
-    assert position_error(record, poses, truth) < 5e-4
-    moved = se2.compose(np.tile([3.0, 4.0, 1.0], (len(poses), 1)), poses)
-    assert position_error(record, moved, truth) < 5e-4
-    path = true_path(record, moved, truth)
-    gap = np.isnan(path[:, 0])
-    assert gap.sum() == 1 and len(path) > 2 * len(truth.rows)
-    centre = se2.compose(np.array([[3.0, 4.0, 1.0]]), np.zeros((1, 3)))[0, :2]
-    np.testing.assert_allclose(np.linalg.norm(path[~gap] - centre, axis=1), 20, atol=1e-3)
+    assert report['ate'] < 5e-4
+    moved = drive(tmp_path / 'moved.g2o', KEYFRAMES, (3.0, 4.0, 1.0))
+    assert compared(capsys, moved, truth, '--plot', tmp_path / 'map.svg')['ate'] < 5e-4
+    whole, drawn = sorted(strokes_of(tmp_path / 'map.svg'), key=len)[-2:]
+    assert len(whole) == 1 and len(drawn) == 2  # with a gap in the hole
+    circle = circle_through(whole[0])
+    np.testing.assert_allclose(circle_through(np.concatenate(drawn)), circle, atol=1e-2)
+    # The keyframes that have no truth count for nothing.
+    away = drive(tmp_path / 'away.g2o', KEYFRAMES, away=np.flatnonzero(~SCORED))
+    assert compared(capsys, away, truth)['ate'] < 5e-4
+    assert report['ate_poses'] == np.count_nonzero(SCORED)
 
 
-def test_a_truth_that_is_slow_throughout_has_no_gaps(tmp_path):
-    record, poses = drive(KEYFRAMES)
+def test_a_truth_that_is_slow_throughout_has_no_gaps(capsys, tmp_path):
     slow = 100 * SECOND + np.arange(0, 60 * SECOND, 5 * SECOND)
-    write_tum(tmp_path / 'truth.tum', slow, true_at(slow), se2)
-    truth = read_truth(str(tmp_path / 'truth.tum'), record, Path('graph.g2o'))
-    assert len(truth.rows) == np.count_nonzero(slow[-1] >= KEYFRAMES)
+    report = compared(capsys, drive(tmp_path / 'graph.g2o', KEYFRAMES),
+                      write_truth(tmp_path / 'truth.tum', slow))
+    assert report['ate_poses'] == np.count_nonzero(slow[-1] >= KEYFRAMES)
 
 
 def recorded(topic, messages):
@@ -92,7 +118,8 @@ def recorded(topic, messages):
 
 
 def message_of(kind, stamp, pose3):
-    x, y, z, *q = se2.to_pose3(pose3[None])[0].tolist()
+    (x, y, theta), z = pose3.tolist(), 0.0
+    q = 0.0, 0.0, np.sin(theta / 2), np.cos(theta / 2)
     new, name = of_rosbags, f'geometry_msgs/msg/{kind}'
     head = header(new, *divmod(int(stamp), SECOND), 'map')
     if kind == 'Odometry':
@@ -107,17 +134,17 @@ def message_of(kind, stamp, pose3):
 
 @pytest.mark.parametrize('kind', [
     'PoseStamped', 'PoseWithCovarianceStamped', 'TransformStamped', 'Odometry'])
-def test_a_topic_is_a_truth(tmp_path, kind):
-    record, poses = drive(KEYFRAMES)
+def test_a_topic_is_a_truth(capsys, tmp_path, kind):
     messages = [message_of(kind, stamp, pose)
                 for stamp, pose in zip(TRUE, true_at(TRUE), strict=True)]
     lost = message_of(kind, TRUE[3], np.array([np.nan, 0.0, 0.0]))
     late = messages[::-1] + messages[:5] + [lost]
     rosbag2_directory(tmp_path / 'mocap', recorded('/robot/truth', late), StoragePlugin.MCAP)
-    truth = read_truth(f'{tmp_path}/mocap:/robot/truth', record, Path('graph.g2o'))
-    assert truth.rows.tolist() == np.flatnonzero(SCORED).tolist()
-    assert position_error(record, poses, truth) < 5e-4
-    assert truth.skipped == (f'1 message on /robot/truth of {tmp_path}/mocap refused: not_finite',)
+    graph = drive(tmp_path / 'graph.g2o', KEYFRAMES, away=np.flatnonzero(~SCORED))
+    report = compared(capsys, graph, f'{tmp_path}/mocap:/robot/truth')
+    assert report['ate_poses'] == np.count_nonzero(SCORED) and report['ate'] < 5e-4
+    assert report['warnings'] == [
+        f'1 message on /robot/truth of {tmp_path}/mocap refused: not_finite']
 
 
 @pytest.mark.parametrize('source, said', [
@@ -128,26 +155,26 @@ def test_a_topic_is_a_truth(tmp_path, kind):
     ('bag:/pose', 'shares 0 poses with the graph, expected 2 or more; it has times from '
      r'1\.0+ to 1\.0+ s, the graph times from [0-9.]+ to [0-9.]+ s$'),
 ])
-def test_a_topic_that_is_none_is_one_line(tmp_path, monkeypatch, source, said):
+def test_a_topic_that_is_none_is_one_line(capsys, tmp_path, monkeypatch, source, said):
     monkeypatch.chdir(tmp_path)
-    record, _ = drive(KEYFRAMES)
     time = ('builtin_interfaces/msg/Time', header(of_rosbags).stamp)
     rosbag2_directory(tmp_path / 'bag', [
         *recorded('/pose', [message_of('PoseStamped', SECOND, np.zeros(3))]),
         *recorded('/time', [time])], StoragePlugin.MCAP)
-    with pytest.raises(FileError, match=said):
-        read_truth(source, record, Path('graph.g2o'))
+    graph = drive(tmp_path / 'graph.g2o', KEYFRAMES)
+    error, = run(capsys, 'solve', graph, '--reference', source, code=2)[1].splitlines()
+    assert re.search(said, error)
 
 
-def test_a_graph_without_stamps_is_said_to_have_none(tmp_path):
-    record, _ = drive(KEYFRAMES)
-    record = GraphRecord(record.graph, record.poses, record.ids)
-    (tmp_path / 'truth.csv').write_text('5, 0, 0, 0\n6, 1, 0, 0\n')
-    with pytest.raises(FileError, match='shares 0 poses with the graph, expected 2 or more; it '
-                       r'has times from 5\.0+ to 6\.0+ s, the graph times from 1000\.0+ to '
-                       r'1008\.20+ s; the graph has no stamps, so its poses are 0.1 s apart from '
-                       '1000 s on'):
-        read_truth(str(tmp_path / 'truth.csv'), record, Path('graph.g2o'))
+def test_a_graph_without_stamps_is_said_to_have_none(capsys, tmp_path):
+    graph, truth = drive(tmp_path / 'graph.g2o', KEYFRAMES), tmp_path / 'truth.csv'
+    Path(f'{graph}.stamps.txt').unlink()
+    truth.write_text('5, 0, 0, 0\n6, 1, 0, 0\n')
+    error, = run(capsys, 'solve', graph, '--reference', truth, code=2)[1].splitlines()
+    assert re.search('shares 0 poses with the graph, expected 2 or more; it '
+                     r'has times from 5\.0+ to 6\.0+ s, the graph times from 1000\.0+ to '
+                     r'1008\.20+ s; the graph has no stamps, so its poses are 0.1 s apart from '
+                     '1000 s on', error)
 
 
 def test_the_command_says_over_how_many_poses(capsys, tmp_path, monkeypatch):

@@ -8,20 +8,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """`l1slam solve --report`: what the page shows, in a browser, and that it settles a doubt."""
 
-import importlib.util
 import json
+import os
+import sys
 
 import numpy as np
 import pytest
 from browser import browser, opened
 from command import run, solve_json
-from problems import chain_of, graph_of
-from torn import torn_graph
-
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.io import files
-from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
-from l1slam_ros.io.ours import REPORT_MARK, is_ours
+from worlds import between, compose, edge, made, torn
 
 pytest.importorskip('plotly')
 # What a person reads and does.
@@ -35,18 +30,18 @@ def ring(path, loops=7, n=600):
     """Write a drive round a ring whose loops are all of one place, 1.2 m long: no run."""
     angle = 2 * np.pi * np.arange(n + loops) / n
     truth = np.column_stack((20 * np.cos(angle), 20 * np.sin(angle), angle))
-    chain, back = chain_of(n + loops), np.arange(loops)
-    pairs = np.concatenate((chain, np.column_stack((back + n, back))))
-    noise = np.random.default_rng(2).standard_normal((len(pairs), 3)) * [0.05, 0.05, 0.005]
-    graph = graph_of(truth, pairs, noise, np.diag([400.0, 400.0, 4e4]))
-    write_graph_file(path, GraphRecord(graph, odometry_poses(graph), 7 + np.arange(n + loops)))
+    i = np.concatenate((np.arange(n + loops - 1), np.arange(loops) + n))
+    j = np.concatenate((np.arange(1, n + loops), np.arange(loops)))
+    noise = np.random.default_rng(2).standard_normal((len(i), 3)) * [0.05, 0.05, 0.005]
+    path.write_text('\n'.join(
+        edge(7 + a, 7 + b, measurement, np.diag([400.0, 400.0, 4e4])) for a, b, measurement in zip(
+            i, j, compose(between(truth[i], truth[j]), noise), strict=True)) + '\n')
     return path
 
 
-def slipped(capsys, path, edges, seed, metres):
+def slipped(path, edges, seed, metres):
     """Simulate a world of 400 keyframes; from 200 to 201 the odometry slips ahead."""
-    run(capsys, 'simulate', path, '--poses', 400, '--edges', edges, '--seed', seed)
-    return slipping(path, 200, metres)
+    return slipping(made(path, 400, edges, '--seed', seed), 200, metres)
 
 
 def slipping(path, i, metres):
@@ -59,28 +54,25 @@ def slipping(path, i, metres):
     return path
 
 
-def weak(capsys, path, edges, seed):
+def weak(path, edges, seed):
     """Simulate a world of 600 keyframes that a hundred lies leave a weak map."""
-    run(capsys, 'simulate', path, '--poses', 600, '--edges', edges, '--false-loops', 100,
-        '--seed', seed)
-    return path
+    return made(path, 600, edges, '--false-loops', 100, '--seed', seed)
 
 
-def torn(path):
-    graph, _ = torn_graph()
-    write_graph_file(path, GraphRecord(graph, odometry_poses(graph), 100 + np.arange(400)))
+def alike(path):
+    """Write a drive whose refused loops agree on another map."""
+    torn(path)
     return path
 
 
 # A name of each: what makes it.
 DOUBTFUL = {
-    **{f'ring of {loops}': lambda _, path, loops=loops: ring(path, loops)
+    **{f'ring of {loops}': lambda path, loops=loops: ring(path, loops)
        for loops in (6, 7, 8, 9)},
-    **{f'slip {seed}': lambda capsys, path, seed=seed: slipped(capsys, path, 430, seed, 0.4)
+    **{f'slip {seed}': lambda path, seed=seed: slipped(path, 430, seed, 0.4)
        for seed in (4, 11, 14)},
-    **{f'weak {seed}': lambda capsys, path, seed=seed: weak(capsys, path, 604, seed)
-       for seed in (0, 1)},
-    'torn': lambda _, path: torn(path)}
+    **{f'weak {seed}': lambda path, seed=seed: weak(path, 604, seed) for seed in (0, 1)},
+    'torn': alike}
 
 
 def shown(page):
@@ -103,7 +95,7 @@ def pairs_of(page):
 
 
 def test_a_page_shows_each_loop_once_with_its_fate_and_the_doubted(capsys, tmp_path):
-    page, report = reported(capsys, torn(tmp_path / 'torn.g2o'))
+    page, report = reported(capsys, alike(tmp_path / 'torn.g2o'))
     data, pairs = shown(page), pairs_of(page)
     words, here = [fate['word'] for fate in data['fates']], data['maps'][0]
     assert len(pairs) == data['loops'] == report['loops'] == len(here['fate'])
@@ -123,7 +115,7 @@ def test_a_page_shows_each_loop_once_with_its_fate_and_the_doubted(capsys, tmp_p
 @pytest.mark.parametrize('kind', DOUBTFUL)
 def test_a_doubt_is_settled_through_the_page(capsys, tmp_path, kind):
     """Either way; what is doubted after that is of other loops."""
-    path = DOUBTFUL[kind](capsys, tmp_path / 'graph.g2o')
+    path = DOUBTFUL[kind](tmp_path / 'graph.g2o')
     page, report = reported(capsys, path)
     settled = report['doubts'][0]['loops']
     found, complaints = opened(page, f"""{HEAD} {PRESS}
@@ -188,7 +180,7 @@ def test_ticks_make_lines_one_by_one_and_are_taken_back(capsys, tmp_path):
 
 
 def test_the_table_is_cut_searched_and_sorted_and_the_map_switched(capsys, tmp_path):
-    page, report = reported(capsys, torn(tmp_path / 'torn.g2o'))
+    page, report = reported(capsys, alike(tmp_path / 'torn.g2o'))
     i, j = report['doubts'][0]['loops'][0]
     found, complaints = opened(page, f"""
         const rows = () => [...document.querySelectorAll('#rows tr')];
@@ -241,7 +233,7 @@ def test_a_slip_and_a_weak_map_have_rivals(capsys, tmp_path):
     rival, = shown(page)['maps'][1:]
     assert rival['name'] == 'rival: every loop believed'
     assert rival['note'].startswith(f'{report["loops"]} loops used')
-    page, report = reported(capsys, slipped(capsys, tmp_path / 'slipped.g2o', 430, 4, 0.4))
+    page, report = reported(capsys, slipped(tmp_path / 'slipped.g2o', 430, 4, 0.4))
     doubt, = report['doubts']
     assert doubt['kind'] == 'a slip suspected'
     *_, rival = shown(page)['maps'][1:]
@@ -251,7 +243,7 @@ def test_a_slip_and_a_weak_map_have_rivals(capsys, tmp_path):
 
 def test_the_rival_of_a_map_with_a_named_slip_is_shown_to_its_last_row(capsys, tmp_path):
     """A step that one map leaves out is in the other: there it is odometry as any."""
-    path = slipping(weak(capsys, tmp_path / 'world.g2o', 606, 1), 300, 6)
+    path = slipping(weak(tmp_path / 'world.g2o', 606, 1), 300, 6)
     page, report = reported(capsys, path)
     assert report['slips'] == [[300, 301]]
     found, complaints = opened(page, f"""{HEAD} {PRESS}
@@ -282,7 +274,7 @@ def test_the_rival_of_a_map_with_a_named_slip_is_shown_to_its_last_row(capsys, t
 def test_on_a_phone_nothing_is_wider_than_the_screen(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name = 'a_recording_with_a_name_that_is_longer_than_a_phone_is_wide_2026_11_28.g2o'
-    weak(capsys, tmp_path / name, 604, 0)
+    weak(tmp_path / name, 604, 0)
     run(capsys, 'convert', name, 'bag')
     for path in tmp_path / name, tmp_path / 'bag':
         page, _ = reported(capsys, path)
@@ -336,7 +328,7 @@ def test_what_was_ticked_is_there_after_a_reload(capsys, tmp_path):
 
 
 def test_a_page_of_what_nobody_judged(capsys, tmp_path):
-    page, _ = reported(capsys, torn(tmp_path / 'torn.g2o'), '--no-robust', code=0)
+    page, _ = reported(capsys, alike(tmp_path / 'torn.g2o'), '--no-robust', code=0)
     data = shown(page)
     assert data['verdict'] == 'All of 165 loops were believed; none was judged.'
     assert set(data['maps'][0]['fate']) == {0} and set(data['maps'][0]['sigmas']) == {None}
@@ -345,7 +337,7 @@ def test_a_page_of_what_nobody_judged(capsys, tmp_path):
 
 def test_a_slip_is_listed_and_cannot_be_ticked(capsys, tmp_path):
     """Only a loop can be vouched for or struck out: the reader of the files says so."""
-    path = slipped(capsys, tmp_path / 'world.g2o', 900, 3, 3.0)
+    path = slipped(tmp_path / 'world.g2o', 900, 3, 3.0)
     page, report = reported(capsys, path, code=0)
     assert report['slips'] == [[200, 201]]
     found, complaints = opened(page, """
@@ -394,7 +386,8 @@ def test_a_page_replaces_a_page_and_nothing_of_others(capsys, tmp_path):
     assert 'was not written by l1slam_ros, so it is not overwritten' in err
     assert err.count('\n') == 1 and page.read_text() == '<html>mine</html>\n'
     reported(capsys, path, '--force')
-    assert is_ours(page) and page.read_text().startswith(f'{REPORT_MARK}\n<!DOCTYPE html>')
+    assert page.read_text().startswith(
+        '<!-- l1slam_ros wrote this file and may replace it -->\n<!DOCTYPE html>')
     reported(capsys, path)
     for name in 'map.png', 'map':
         err = run(capsys, 'solve', path, '--report', tmp_path / name, code=2)[1]
@@ -413,9 +406,7 @@ def test_a_page_replaces_a_page_and_nothing_of_others(capsys, tmp_path):
 
 
 def test_without_the_library_one_line_says_so_before_the_work(capsys, tmp_path, monkeypatch):
-    found = importlib.util.find_spec
-    monkeypatch.setattr('l1slam_ros.cli.report.page.find_spec',
-                        lambda name: None if name == 'plotly' else found(name))
+    monkeypatch.setitem(sys.modules, 'plotly', None)
     out, err = run(capsys, 'solve', tmp_path / 'absent.g2o', '--report', tmp_path / 'map.html',
                    code=2)
     assert (out, err) == ('', "l1slam: --report draws with plotly, which is not installed; "
@@ -432,7 +423,7 @@ def test_a_page_is_written_whole_or_not_at_all(capsys, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr(files.os, 'replace', full)
+    monkeypatch.setattr(os, 'replace', full)
     err = run(capsys, 'solve', path, '--report', page, '--quiet', code=2)[1]
     assert 'No space left' in err and page.read_bytes() == before
     assert sorted(one.name for one in tmp_path.iterdir()) == ['map.html', 'ring.g2o']

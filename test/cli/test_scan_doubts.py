@@ -11,6 +11,7 @@
 import contextlib
 import io
 import json
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -26,10 +27,9 @@ from rooms import (
     write_scan_bag,
     write_truth,
 )
+from worlds import between, compose
 
 from l1slam_ros.cli.main import main
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.scans.points import Scan
 
 ROUND = along(np.array([(1.5, 1.5), (10.5, 1.5), (10.5, 6.5), (1.5, 6.5)] * 2 + [(1.5, 1.8)]))
 BACK = np.array([(1.5, 6.4), (1.5, 1.5), (10.5, 1.5), (10.5, 6)])
@@ -51,8 +51,8 @@ def equal_rooms():
     """Return a drive into one of two equal rooms, into the other, and into the first again."""
     room = np.array([(0, 0, 4, 0), (0, 0, 0, 4), (4, 0, 4, 4), (0, 4, 1.5, 4), (2.5, 4, 4, 4),
                      (1, 1.2, 1.8, 1.2), (1, 1.2, 1, 2)], float)
-    between = np.array([(4, 4, 8, 4), (-2, 4, 0, 4), (12, 4, 14, 4), *box(-2, 4, 14, 6)[1:]])
-    walls = np.concatenate((room, room + (8, 0, 8, 0), between))
+    hall = np.array([(4, 4, 8, 4), (-2, 4, 0, 4), (12, 4, 14, 4), *box(-2, 4, 14, 6)[1:]])
+    walls = np.concatenate((room, room + (8, 0, 8, 0), hall))
     inside = np.array([(2, 5), (2, 3), (3.2, 3), (3.2, 0.6), (2.4, 0.6), (2.4, 3), (2, 3), (2, 5)])
     way = along(np.concatenate((inside, inside + (8, 0), inside[:4])))
     return way, *drive(way, walls=walls)
@@ -61,10 +61,10 @@ def equal_rooms():
 def standing(true, scans, first, last):
     """Return a drive whose wheels stand between two scans."""
     wheels = drive(true)[1]
-    steps = se2.between(wheels[:-1], wheels[1:])
+    steps = between(wheels[:-1], wheels[1:])
     steps[first:last] = 0
     for k, step in enumerate(steps):
-        wheels[k + 1] = se2.compose(wheels[k][None], step[None])[0]
+        wheels[k + 1] = compose(wheels[k], step)
     return true, scans, wheels
 
 
@@ -80,8 +80,7 @@ def carried_in_the_dark():
     """Return one in which it is carried for 20 s and no scan is taken."""
     at = len(ROUND) // 3
     true = np.concatenate((ROUND[:at], along(np.concatenate(([(7, 6.2)], BACK)))))
-    scans = [Scan(scan.stamp + 20 * 10**9 * (k >= at), scan.ranges, scan.angle_min,
-                  scan.angle_increment, scan.range_min, scan.range_max)
+    scans = [replace(scan, stamp=scan.stamp + 20 * 10**9 * (k >= at))
              for k, scan in enumerate(drive(true)[0])]
     return standing(true, scans, at - 1, at)
 
@@ -100,9 +99,7 @@ def carried_elsewhere():
 def upside_down():
     """Return a drive with a laser that hangs, which nobody says."""
     scans, wheels = drive(ROUND)
-    return ROUND, [Scan(scan.stamp, np.roll(scan.ranges[::-1], 1), scan.angle_min,
-                        scan.angle_increment, scan.range_min, scan.range_max)
-                   for scan in scans], wheels
+    return ROUND, [replace(scan, ranges=np.roll(scan.ranges[::-1], 1)) for scan in scans], wheels
 
 
 def without_wheels():

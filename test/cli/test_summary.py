@@ -12,15 +12,10 @@ import re
 
 import numpy as np
 import pytest
-from command import solve_json
-from problems import retold
+from command import run, solve_json
+from worlds import compose, edge, edges_of, made, whitened
 
-from l1slam_ros.cli.summary import complaints, numbers
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.solvers.optimality import l1_cost
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+import l1slam_ros as l1
 
 # Vertices 10, 11, 12, 13, 14 in a row, and a loop.
 LINES = [f'EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1' for k in range(10, 14)]
@@ -28,12 +23,33 @@ LOOP = 'EDGE_SE2 10 14 4 0 0 1 0 0 1 0 1'
 
 
 @pytest.fixture
-def record_of(tmp_path):
-    def read(*lines):
-        path = tmp_path / 'a.g2o'
-        path.write_text('\n'.join(lines) + '\n')
-        return read_graph_file(path)
-    return read
+def info(capsys, tmp_path):
+    """Return what writes lines as a graph, and returns its numbers and what looks wrong of it."""
+    def written(*lines):
+        (tmp_path / 'a.g2o').write_text('\n'.join(lines) + '\n')
+        return info_of(capsys, tmp_path / 'a.g2o')
+    return written
+
+
+def info_of(capsys, path):
+    """Return the numbers of a graph, and the sentences on it."""
+    said = run(capsys, 'info', path)[0].splitlines()
+    complaints = [line[2:] for line in said if line.startswith('- ')]
+    assert ('nothing looks wrong' in said) == (not complaints)
+    return {line[:12].rstrip(): line[12:] for line in said
+            if not line.startswith('- ') and line != 'nothing looks wrong'}, complaints
+
+
+def other(path, loops=(0.0, 0.0, 0.0), times=(1.0, 1.0), first=0):
+    """
+    Return the lines of a world, other than it was.
+
+    loops : the steps that its loops are off by; times : how large sigmas of the odometry and of
+    loops are stated; first : the id of the first vertex
+    """
+    return [edge(first + i, first + j, measurement if j == i + 1 else compose(
+        measurement, np.array(loops)), information / times[j != i + 1]**2)
+        for i, j, measurement, information in edges_of(path)]
 
 
 @pytest.mark.parametrize('more, sentence', [
@@ -52,41 +68,43 @@ def record_of(tmp_path):
                                               for k in range(15, 30))],
      'odometry that jumps: 1 step (50 m from 14 to 15); nine in ten are no longer than 1 m'),
 ])
-def test_each_thing_that_looks_wrong_is_one_sentence(record_of, more, sentence):
-    assert sentence in complaints(record_of(*LINES, *more))
+def test_each_thing_that_looks_wrong_is_one_sentence(info, more, sentence):
+    assert sentence in info(*LINES, *more)[1]
 
 
-def test_ids_of_all_64_bits_are_not_consecutive(record_of):
+def test_ids_of_all_64_bits_are_not_consecutive(info):
     least, most = -2**63, 2**63 - 1
-    assert complaints(record_of(f'EDGE_SE2 {least} {most} 1 0 0 1 0 0 1 0 1')) == [
+    assert info(f'EDGE_SE2 {least} {most} 1 0 0 1 0 0 1 0 1')[1] == [
         f'vertex ids are not consecutive: 1 jump ({least} to {most})']
 
 
-def test_a_ratio_that_is_none_is_not_named(record_of):
+def test_a_ratio_that_is_none_is_not_named(info, tmp_path):
     """Of as few loops as these nothing is known but that the odometry suffers from them."""
-    world = simulate_world(600, 630, WorldOptions(), np.random.default_rng(0))
-    factors = world.graph.between
-    noisy = factors.measurement + np.where(factors.is_odometry, 0.0, 1.0)[:, None]
-    said, = complaints(GraphRecord(retold(world.graph, noisy), None, np.arange(600)))
+    world = made(tmp_path / 'world.g2o', 600, 630)
+    said, = info(*other(world, loops=(1.0, 1.0, 1.0)))[1]
     assert re.search(r' are [0-9.]+ \(odometry\) times what the information says; ', said)
 
 
-def test_vertices_without_an_edge(record_of):
+def test_vertices_without_an_edge(info):
     lonely = [f'VERTEX_SE2 {k} 0 0 0' for k in range(10, 20)]
-    assert complaints(record_of(*lonely, *LINES, LOOP)) == [
+    assert info(*lonely, *LINES, LOOP)[1] == [
         'no edge leads to 5 vertices (15, 16, 17, ...): place unknown',
         'the odometry has 5 gaps (14 and 15, 15 and 16, 16 and 17, ...), consecutive vertices '
         'without an edge']
 
 
+@pytest.fixture(scope='module')
+def noisy(tmp_path_factory):
+    """Return a world whose noise is known."""
+    return made(tmp_path_factory.mktemp('noisy') / 'world.g2o', 600, 1800)
+
+
 @pytest.mark.parametrize('odometry, loops, reason', [
     (8, 1, 'too small'), (1, 8, 'too small'), (0.1, 1, 'too large, or some loops are false'),
     (1, 0.1, 'too large, or some loops are false'), (1, 1, None)])
-def test_information_off_by_scale(rng, odometry, loops, reason):
-    """Of a world whose noise is known, told sigmas that many times as large."""
-    world = simulate_world(600, 1800, WorldOptions(), rng)
-    times = np.where(world.graph.between.is_odometry, odometry, loops)
-    found = complaints(GraphRecord(retold(world.graph, times=times), None, 5 + np.arange(600)))
+def test_information_off_by_scale(info, noisy, odometry, loops, reason):
+    """Told sigmas that many times as large."""
+    found = info(*other(noisy, times=(odometry, loops), first=5))[1]
     if reason is None:
         assert found == []
         return
@@ -99,55 +117,50 @@ def test_information_off_by_scale(rng, odometry, loops, reason):
     assert float(ratios[2]) * loops == pytest.approx(1, rel=0.1)
 
 
-def test_an_offset_that_loops_share_is_one_sentence(rng, tmp_path, capsys):
+def test_an_offset_that_loops_share_is_one_sentence(info, tmp_path, capsys):
     """The same of `info` and `solve`; noise makes none."""
-    graph = simulate_world(400, 1000, WorldOptions(), rng).graph
-    off = np.where(graph.between.is_odometry[:, None], 0.0, [-0.3, 0.4, 0.05])
-    shifted = retold(graph, se2.retract(graph.between.measurement, off))
-    write_graph_file(tmp_path / 'a.g2o', GraphRecord(graph, None, np.arange(400)))
-    assert solve_json(capsys, tmp_path / 'a.g2o')['warnings'] == []
-    write_graph_file(tmp_path / 'b.g2o', GraphRecord(shifted, None, np.arange(400)))
-    sentence, = solve_json(capsys, tmp_path / 'b.g2o')['warnings']
-    assert solve_json(capsys, tmp_path / 'b.g2o', '--no-robust')['warnings'] == []
-    for said in sentence, complaints(GraphRecord(shifted, None, np.arange(400)))[0]:
+    path = made(tmp_path / 'world.g2o', 400, 1000)
+    assert solve_json(capsys, path)['warnings'] == []
+    complaint, *_ = info(*other(path, loops=(-0.3, 0.4, 0.05)))[1]
+    sentence, = solve_json(capsys, tmp_path / 'a.g2o')['warnings']
+    assert solve_json(capsys, tmp_path / 'a.g2o', '--no-robust')['warnings'] == []
+    for said in sentence, complaint:
         found = re.match(r'loops share an offset of (.*) m and (.*) degrees, more than', said)
         assert float(found[1]) == pytest.approx(0.5, abs=0.05)
         assert float(found[2]) == pytest.approx(2.9, abs=0.3)
 
 
-def test_the_repeated_edges_of_intel(datasets):
-    record = read_graph_file(datasets / 'intel.g2o')
-    assert complaints(record)[0].startswith('2 edges (60 to 863, 179 to 864): given before')
-    assert dict(numbers(record)) == {
+def test_the_repeated_edges_of_intel(capsys, datasets):
+    numbers, complaints = info_of(capsys, datasets / 'intel.g2o')
+    assert complaints[0].startswith('2 edges (60 to 863, 179 to 864): given before')
+    assert numbers == {
         'poses': '943 in SE2, ids 0 to 942', 'odometry': '942, 492.9 m',
         'loops': '895, 4 of them beside another edge', 'components': '1',
         'l1 cost': '1513.17 at the stored poses'}
 
 
-def test_the_numbers_of_a_graph_with_everything(record_of, tmp_path):
+def test_the_numbers_of_a_graph_with_everything(info, tmp_path):
     (tmp_path / 'a.g2o.stamps.txt').write_text(''.join(f'{k} {k}.5\n' for k in range(10, 15)))
-    record = record_of(*LINES, LOOP, 'EDGE_PRIOR_SE2 10 0 0 0 1 0 0 1 0 1')
-    assert dict(numbers(record)) == {
+    assert info(*LINES, LOOP, 'EDGE_PRIOR_SE2 10 0 0 0 1 0 0 1 0 1')[0] == {
         'poses': '5 in SE2, ids 10 to 14', 'odometry': '4, 4.0 m', 'loops': '1',
         'absolute': '1', 'components': '1', 'time': '4.0 s'}
 
 
-def test_what_a_person_struck_out_is_counted_and_asked_no_more(rng):
-    world = simulate_world(200, 500, WorldOptions(), rng)
-    record = GraphRecord(world.graph, world.truth, np.arange(200))
-    cost, lies = dict(numbers(record))['l1 cost'], 10
-    world.graph.append_between(*(np.repeat(column[-1:], lies, axis=0) for column in (
-        np.array([3]), np.array([180]), np.array([[9.0, 9.0, 1.0]]), 100 * np.eye(3)[None])))
-    assert complaints(record) and dict(numbers(record))['l1 cost'] != cost
-    world.graph.say(len(world.graph.between) - 1 - np.arange(lies), trusted=False)
-    assert complaints(record) == []
-    found = dict(numbers(record))
-    assert found['loops'].endswith(', 10 of them struck out') and found['l1 cost'] == cost
+def test_what_a_person_struck_out_is_counted_and_asked_no_more(info, tmp_path):
+    lines = made(tmp_path / 'world.g2o', 200, 500).read_text().splitlines()
+    cost, lies = info(*lines)[0]['l1 cost'], 10
+    lines += [edge(3, 180, (9.0, 9.0, 1.0), 100 * np.eye(3))] * lies
+    numbers, complaints = info(*lines)
+    assert complaints and numbers['l1 cost'] != cost
+    (tmp_path / 'a.g2o.struck.txt').write_text('3 180\n')
+    numbers, complaints = info(*lines)
+    assert complaints == []
+    assert numbers['loops'].endswith(', 10 of them struck out') and numbers['l1 cost'] == cost
 
 
-def test_the_cost_is_that_which_is_minimised(record_of, rng):
+def test_the_cost_is_that_which_is_minimised(info, rng, tmp_path):
     vertices = [f'VERTEX_SE2 {k} {rng.normal()} {rng.normal()} {rng.normal()}'
                 for k in range(10, 15)]
-    record = record_of(*vertices, *LINES, LOOP, 'EDGE_PRIOR_SE2 12 1 2 .5 4 1 1 5 1 6')
-    expected = l1_cost(whitened_residual(record.graph, record.poses))
-    assert dict(numbers(record))['l1 cost'] == f'{expected:.6g} at the stored poses'
+    numbers, _ = info(*vertices, *LINES, LOOP, 'EDGE_PRIOR_SE2 12 1 2 .5 4 1 1 5 1 6')
+    expected = np.abs(whitened(*l1.read_graph(tmp_path / 'a.g2o'))).sum()
+    assert numbers['l1 cost'] == f'{expected:.6g} at the stored poses'

@@ -19,14 +19,12 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import bad_jobs
 import pytest
+from bad_jobs import BAD_JOBS, stop
 from command import run
+from worlds import made
 
-from l1slam_ros.core.kernels.kept import objects
-from l1slam_ros.fleet.finding import find
 from l1slam_ros.fleet.isolated import Job, Limits, results
-from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, fill_cache
 
 DASK = [sys.executable, '-m', 'distributed.cli.dask_']
 SECONDS = 120  # of patience
@@ -35,14 +33,12 @@ SECONDS = 120  # of patience
 @pytest.fixture(scope='module')
 def recordings(tmp_path_factory):
     """Six recordings, two of them hostile; the last one in order takes longest."""
-    from l1slam_ros.cli.main import main
     folder = tmp_path_factory.mktemp('recordings')
     (folder / 'deep').mkdir()
     for name, poses in (('a.g2o', 40), ('deep/b.g2o', 50), ('c.graph', 60), ('z.g2o', 1500)):
-        made = folder / name
-        main(['simulate', str(made.with_suffix('.g2o')), '--poses', str(poses), '--edges',
-              str(int(1.5 * poses)), '--false-loops', '2'])
-        made.with_suffix('.g2o').rename(made)
+        path = made((folder / name).with_suffix('.g2o'), poses, int(1.5 * poses),
+                    '--false-loops', 2)
+        path.rename(folder / name)
     (folder / 'deep' / 'nonsense.g2o').write_text('a poem\n')
     (folder / 'empty.mcap').touch()
     return folder
@@ -346,54 +342,76 @@ def test_what_cannot_be_asked_for_is_refused(recordings, tmp_path, capsys, optio
     assert sentence in said and said.count('\n') == 1
 
 
-def ended(work, job, limits):
-    [(_, found)] = results(work, [job], limits, 1)
-    return found
+def beside_python_path(folder):
+    """Return the PYTHONPATH of a process that begins with what a folder has."""
+    return os.pathsep.join([str(folder), *filter(None, [os.environ.get('PYTHONPATH')])])
+
+
+@pytest.fixture(scope='module')
+def ended(recordings, tmp_path_factory):
+    """Return what comes of recordings that end the process which reads them, by their names."""
+    folder, hooks = tmp_path_factory.mktemp('bad'), tmp_path_factory.mktemp('hooks')
+    (hooks / 'sitecustomize.py').write_text(BAD_JOBS)
+    for name in ('bomb', 'quiet', 'endless', 'clock', 'crash', 'crash_once'):
+        shutil.copy(recordings / 'a.g2o', folder / f'{name}.g2o')
+    output = tmp_path_factory.mktemp('ended') / 'results'
+    process = command(folder, output, '--retries', '1', '--seconds', '3', '--memory', '2',
+                      PYTHONPATH=beside_python_path(hooks))
+    said = process.communicate(timeout=SECONDS)[1]
+    assert process.returncode == 3, said
+    return rows(output), said
 
 
 @pytest.mark.parametrize(('what', 'sentence'), [
-    ('bomb', 'ended with code 1 and said nothing, 2 times'),
-    ('endless', 'took more than 1 s of the processor'), ('clock', 'took more than 10 s by the'),
-    ('crash', 'ended by signal 11, Segmentation fault, 2 times'),
-    ('stop', 'stalled: no sign of life for 1 s, 2 times')])
-def test_what_ends_a_process_is_said(tmp_path, capsys, what, sentence):
+    ('bomb', 'not enough memory'), ('quiet', 'ended with code 1 and said nothing, 2 times'),
+    ('endless', 'took more than 3 s of the processor'), ('clock', 'took more than 30 s by the'),
+    ('crash', 'ended by signal 11, Segmentation fault, 2 times')])
+def test_what_ends_a_process_is_said(ended, what, sentence):
+    row, said = ended[0][f'{what}.g2o'], ended[1]
+    assert row['status'] == 'failed' and sentence in row['sentence']
+    again = [line for line in said.splitlines() if f'{what}.g2o' in line]
+    assert any('tried again' in line for line in again) == ('2 times' in sentence)
+
+
+def test_what_crashes_once_is_tried_again(ended):
+    assert ended[0]['crash_once.g2o']['status'] == 'converged'
+    assert 'crash_once.g2o: its process was ended by signal 11' in ended[1]
+
+
+def test_a_process_that_stalls_is_ended(tmp_path, capsys):
+    """No option of the command says after how long; it would take two minutes."""
     job = Job('name', 'input', str(tmp_path / 'map'))
-    limits = Limits(60 if what == 'bomb' else 1, 2 * 10**9, 1, 1 if what == 'stop' else 60)
-    row = ended(getattr(bad_jobs, what), job, limits)['row']
-    assert row['recording'] == 'name' and row['status'] == 'failed'
-    assert sentence in row['sentence']
-    assert ('tried again' in capsys.readouterr().err) == ('2 times' in sentence)
-
-
-def test_what_crashes_once_is_tried_again(tmp_path):
-    job = Job('name', 'input', str(tmp_path / 'map'))
-    found = ended(bad_jobs.crash_once, job, Limits(60, 2 * 10**9, 1))
-    assert found['row'] == {'recording': 'name', 'status': 'converged'} and found['attempts'] == 2
-
-
-def states():
-    return {path: os.stat(path).st_mtime_ns
-            for step in (*SPARSE, *JUDGEMENT) for path in objects.files(step)}
+    [(_, found)] = results(stop, [job], Limits(1, 2 * 10**9, 1, 1), 1)
+    assert found['row']['recording'] == 'name' and found['row']['status'] == 'failed'
+    assert 'stalled: no sign of life for 1 s, 2 times' in found['row']['sentence']
+    assert 'tried again' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('threads', [None, '1', '2'])
-def test_a_job_compiles_nothing_once_the_cache_is_full(recordings, tmp_path, monkeypatch, threads):
+def test_a_job_compiles_nothing_once_the_cache_is_full(
+        recordings, tmp_path, monkeypatch, capsys, threads):
     """Whatever a worker's environment says of the threads of loops, of which none has many."""
-    assert fill_cache(lambda done, total: None, lambda: False, (*SPARSE, *JUDGEMENT))
-    before = states()
+    (tmp_path / 'in').mkdir()
+    shutil.copy(recordings / 'a.g2o', tmp_path / 'in')
+    (tmp_path / 'sitecustomize.py').write_text(
+        "import sys\nsys.addaudithook(lambda event, about: event == 'import' and about[0] == "
+        f"'numba' and open({str(tmp_path / 'numba')!r}, 'w').close())\n")
+    monkeypatch.setenv('PYTHONPATH', beside_python_path(tmp_path))
     if threads:
         monkeypatch.setenv('NUMBA_NUM_THREADS', threads)
-    job = Job('a', str(recordings / 'a.g2o'), str(tmp_path / 'map.g2o'))
-    row = ended(bad_jobs.prepared, job, Limits(SECONDS, 10**10, 0))['row']
-    assert row['status'] != 'failed' and not row['numba']
-    assert before and states() == before
+    run(capsys, 'batch', tmp_path / 'in', '--output', tmp_path / 'results', '--workers', '1')
+    assert rows(tmp_path / 'results')['a.g2o']['status'] == 'converged'
+    assert not (tmp_path / 'numba').exists(), 'what compiles imports it'
 
 
-def test_recordings_are_found_however_deep_and_bags_as_a_whole(tmp_path):
-    for name in ('b/bag/metadata.yaml', 'b/bag/bag_0.mcap', 'b/loose.mcap', 'a.G2O', 'notes.txt',
-                 '.hidden/x.g2o', 'out/maps/a.g2o', 'metadata.yaml'):
+def test_recordings_are_found_however_deep_and_bags_as_a_whole(tmp_path, capsys):
+    for name in ('b/bag/metadata.yaml', 'b/bag/bag_0.mcap', 'b/loose.mcap', 'notes.txt',
+                 '.hidden/x.g2o', 'metadata.yaml'):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text('x')
+    (tmp_path / 'a.G2O').write_text('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n')
     (tmp_path / 'b' / 'circle').symlink_to(tmp_path)
-    found = [one.name for one in find(tmp_path, tmp_path / 'out')]
-    assert found == ['a.G2O', 'b/bag', 'b/loose.mcap']
+    for more in (), ('--resume',):  # the second time its own maps are there, too
+        run(capsys, 'batch', tmp_path, '--output', tmp_path / 'out', *more, code=3)
+        assert list(rows(tmp_path / 'out')) == ['a.G2O', 'b/bag', 'b/loose.mcap']
+        assert (tmp_path / 'out' / 'maps' / 'a.G2O.g2o').exists()

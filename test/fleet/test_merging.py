@@ -13,10 +13,9 @@ import json
 import numpy as np
 import pytest
 from command import run, solve_json
+from worlds import lines_of, made
 
-from l1slam_ros.core.errors import GraphError
-from l1slam_ros.fleet.numbering import numbered
-from l1slam_ros.io.formats import read_input
+import l1slam_ros as l1
 
 HALF = 200
 SYMBOL = 1 << 56
@@ -26,11 +25,7 @@ A, B = ord('a') * SYMBOL, ord('b') * SYMBOL
 @pytest.fixture(scope='module')
 def world(tmp_path_factory):
     """A graph of 400 keyframes with 10 false loops."""
-    from l1slam_ros.cli.main import main
-    path = tmp_path_factory.mktemp('world') / 'world.g2o'
-    main(['simulate', str(path), '--poses', str(2 * HALF), '--edges', '800', '--false-loops',
-          '10'])
-    return path
+    return made(tmp_path_factory.mktemp('world') / 'world.g2o', 2 * HALF, 800, '--false-loops', 10)
 
 
 def cut(world, folder, ids=lambda k: k % HALF, write=lambda k: f'{k // HALF + 1}:{k % HALF}'):
@@ -58,6 +53,10 @@ def listed(folder, between):
     path = folder / 'loops.txt'
     path.write_text('\n'.join(between) + '\n')
     return path
+
+
+def ids_of(path):
+    return [int(row[0]) for row in lines_of(path, 'VERTEX')]
 
 
 def merge_json(capsys, *arguments, code=0):
@@ -96,9 +95,10 @@ def test_symbols_stay_and_edges_to_the_other_file_are_used_once(world, tmp_path,
     assert 'is unknown' in run(capsys, 'solve', paths[0], code=2)[1]
     found, said = merge_json(capsys, *paths, '--output', tmp_path / 'out.g2o')
     assert f'{len(between)} edges to another input given there, too: used once' in said
-    record = read_input(tmp_path / 'out.g2o')
-    assert record.ids.tolist() == [A + k for k in range(HALF)] + [B + k for k in range(HALF)]
-    assert np.unique(record.graph.robot, return_counts=True)[1].tolist() == [HALF, HALF]
+    assert ids_of(tmp_path / 'out.g2o') == [
+        A + k for k in range(HALF)] + [B + k for k in range(HALF)]
+    graph, _ = l1.read_graph(tmp_path / 'out.g2o')
+    assert np.unique(graph.robot, return_counts=True)[1].tolist() == [HALF, HALF]
     assert len(found['rejected']) == 10 and found['parts'] == 1
 
 
@@ -107,7 +107,7 @@ def test_what_does_not_join_lies_beside_and_is_said(world, tmp_path, capsys):
     found, said = merge_json(capsys, *paths, '--output', tmp_path / 'out.g2o', code=4)
     assert found['parts'] == 2
     assert said.count(f'{paths[1]}: nothing that is believed joins it to {paths[0]}') == 1
-    poses = read_input(tmp_path / 'out.g2o').poses
+    _, poses = l1.read_graph(tmp_path / 'out.g2o')
     assert poses[:HALF, 0].max() < poses[HALF:, 0].min()
     alone = [solve_json(capsys, path)['final_cost'] for path in paths]
     assert found['final_cost'] == pytest.approx(sum(alone), rel=1e-3)
@@ -177,12 +177,19 @@ def test_an_edge_that_two_others_could_mean_is_refused(world, tmp_path, capsys):
     assert f'{third}:4: vertex 7 is of 2 other inputs' in said
 
 
-def test_ids_are_shifted_only_where_they_collide():
+def test_ids_are_shifted_only_where_they_collide(tmp_path, capsys):
+    def merged(*graphs, code=4):
+        """Merge chains of these ids, which nothing joins; return the ids of the map."""
+        paths = [tmp_path / f'{k}.g2o' for k in range(len(graphs))]
+        for path, ids in zip(paths, graphs, strict=True):
+            path.write_text(''.join(f'EDGE_SE2 {i} {j} 1 0 0 1 0 0 1 0 1\n'
+                                    for i, j in zip(ids[:-1], ids[1:], strict=True)))
+        said = run(capsys, 'merge', *paths, '--output', tmp_path / 'out.g2o', code=code)[1]
+        return said if code == 2 else sorted(ids_of(tmp_path / 'out.g2o'))
+
     first, second = np.arange(5), np.arange(5, 12)
-    assert [ids.tolist() for ids in numbered([first, second])] == [
-        first.tolist(), second.tolist()]
-    assert numbered([second, first + 3, first])[1].tolist() == [103, 104, 105, 106, 107]
-    assert numbered([first + A, first + A, first + B])[1].tolist() == (
-        first + ord('c') * SYMBOL).tolist()
-    with pytest.raises(GraphError, match='cannot be made distinct'):
-        numbered([np.array([1, 2**55]), np.array([1, 1000])])
+    assert merged(first, second) == list(range(12))
+    assert merged(second, first + 3, first) == [*range(12), 103, 104, 105, 106, 107]
+    assert merged(first + A, first + A, first + B) == [
+        letter + k for letter in (A, B, ord('c') * SYMBOL) for k in range(5)]
+    assert 'cannot be made distinct' in merged([1, 2**55], [1, 1000], code=2)

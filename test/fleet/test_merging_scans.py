@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from command import run
 from rooms import WALLS, box, drive, laps, write_log, write_scan_bag, write_truth
-
-from l1slam_ros.core.geometry import se2
+from worlds import compose
 
 # A room that looks like itself from one place alone: one side of it is much wider.
 ONE_SIDED = np.vstack((box(0, 0, 16, 8), WALLS[4:]))
@@ -27,7 +26,7 @@ def drives(folder, walls):
     scans, wheels = drive(true, walls=walls)
     half, begin = len(scans) // 2, len(scans) // 2 + 8
     write_log(folder / 'first.clf', scans[:half], wheels[:half])
-    elsewhere = se2.compose(np.tile((5.0, -3.0, 2.0), (len(scans) - begin, 1)), wheels[begin:])
+    elsewhere = compose(np.array([5.0, -3.0, 2.0]), wheels[begin:])
     write_scan_bag(folder / 'second', scans[begin:], elsewhere)
     write_log(folder / 'second.clf', scans[begin:], elsewhere)
     kept = np.r_[:half, begin:len(scans)]
