@@ -14,7 +14,7 @@ Damaged inputs of every kind that is read: each ends in order, in little time an
 
 Small inputs of each kind are written and damaged at random: bytes, numbers, fields, lines, cells
 of a database, messages. A random command then reads one in a process of its own. It may end with 0,
-2, 3 or 4, with one line for 2, within 20 s and 1 GiB, and without a traceback or a warning of
+2, 3 or 4, with one line that says why for 2, within 20 s and 1 GiB, and without a traceback or a warning of
 Python. Printed is a table by kind, and how each failure is repeated; then the exit code is 1.
 """
 
@@ -78,11 +78,7 @@ def main() -> int:
         _in_silence(lambda: write_kinds(sound))
         found = _all(numbers, asked, sound, work)
     _print_table(found)
-    wrong = [run for run in found if run.wrong]
-    for run in wrong:
-        print(f'{run.kind}, {run.code}, {run.seconds:.1f} s, {run.memory >> 10} MiB: {run.wrong}\n'
-              f'    --seed {asked.seed} --only {run.number}    {" ".join(run.words)}')
-    return 1 if wrong else 0
+    return int(any(run.wrong for run in found))
 
 
 def _in_silence(work) -> None:
@@ -114,8 +110,12 @@ def _all(numbers, asked: argparse.Namespace, sound: Path, work: Path) -> list[Ru
         number_of, name, words, begun = running.pop(child)
         said = (work / str(number_of) / 'said.txt').read_text(errors='replace')
         code, seconds = os.waitstatus_to_exitcode(status), time.monotonic() - begun
-        found.append(Run(number_of, name, words, code, seconds, used.ru_maxrss,
-                         _wrong(code, seconds, used.ru_maxrss, said)))
+        run = Run(number_of, name, words, code, seconds, used.ru_maxrss,
+                  _wrong(words, code, seconds, used.ru_maxrss, said))
+        found.append(run)
+        if run.wrong:
+            print(f'{name}, {code}, {seconds:.1f} s, {run.memory >> 10} MiB: {run.wrong}\n'
+                  f'    --seed {asked.seed} --only {number_of}    {" ".join(words)}', flush=True)
         if asked.only is not None:
             print(said)
         if asked.keep is None:
@@ -168,20 +168,22 @@ def _load(path: Path) -> int:
             backend.settle()
             backend.loop_states()
     except l1.L1SlamError as error:
-        print(error, file=sys.stderr)
+        print(f'l1slam: {error}', file=sys.stderr)
         return 2
     return 0
 
 
-def _wrong(code: int, seconds: float, memory: int, said: str) -> str:
+def _wrong(words: tuple[str, ...], code: int, seconds: float, memory: int, said: str) -> str:
     """Return what is wrong with a run, in words, or nothing."""
     last = said.strip().rpartition('\n')[2]
     if 'Traceback' in said or 'Warning' in said:
         return last
     if code not in CODES:
         return f'signal {-code}' if code < 0 else last
-    if code == 2 and said.count('\n') != 1:
-        return f'{said.count(chr(10))} lines: {said[:300]!r}'
+    lines = said.splitlines()
+    if not all(line.startswith('l1slam: ') for line in lines) or (
+            code == 2 and (not lines or '--quiet' in words and len(lines) > 1)):
+        return repr(said[:300])
     if seconds > MOST_SECONDS:
         return 'too long'
     return 'too much memory' if memory > MOST_MEMORY else ''

@@ -10,6 +10,7 @@
 
 import bz2
 import gzip
+import json
 import re
 import sqlite3
 import struct
@@ -20,6 +21,7 @@ from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
 
+import cbor2
 import numpy as np
 import zstandard
 from mcap.reader import make_reader
@@ -55,6 +57,12 @@ def mutate(path: Path, rng: Random, sound: Path) -> None:
         _ros1(path, rng)
         return
     content = path.read_bytes()
+    if path.suffix == '.cbor' and rng.random() < 0.7:
+        with suppress(ValueError):
+            text = _damaged(json.dumps(cbor2.loads(content)).encode(), rng, sound)
+            content = cbor2.dumps(json.loads(text))
+        path.write_bytes(content)
+        return
     if '.mcap' in path.name and rng.random() < 0.6:
         packed = path.suffix == '.zstd'
         made = _mcap(zstandard.ZstdDecompressor().decompressobj().decompress(content) if packed else content, rng)
@@ -200,6 +208,8 @@ def _numbers(content: bytes, rng: Random) -> bytes:
 
     def new(old: bytes) -> bytes:
         with suppress(ValueError):
+            if old.isdigit() and rng.random() < 0.5:  # of a vertex, a count
+                return b'%d' % rng.integers(40)
             if rng.random() < 0.5:
                 return repr(float(old) * scale).encode()
         return same if rng.random() < 0.7 else EXTREMES[rng.integers(len(EXTREMES))]
@@ -262,17 +272,19 @@ def _array(content: bytes, rng: Random) -> bytes:
 
 def _cells(path: Path, rng: Random) -> None:
     """Replace cells of a database, or drop or rename what is in it."""
-    with closing(sqlite3.connect(path)) as database, suppress(sqlite3.Error):
+    with closing(sqlite3.connect(path)) as database, suppress(sqlite3.Error, ValueError):
         tables = [row[0] for row in database.execute(
             "SELECT name FROM sqlite_master WHERE type = 'table'")]
         for _ in range(rng.integers(1, 4)):
             table = tables[rng.integers(len(tables))]
             columns = [row[1] for row in database.execute(f'PRAGMA table_info({table})')]
+            if not columns:  # dropped
+                continue
             column = columns[rng.integers(len(columns))]
             value = CELLS[rng.integers(len(CELLS))]
             every = int(rng.choice([1, 2, 17, 40]))
             way = rng.random()
-            with suppress(sqlite3.Error, OverflowError):
+            with suppress(sqlite3.Error, OverflowError, TypeError):
                 if way < 0.05:
                     database.execute(f'DROP TABLE {table}')
                 elif way < 0.1:
