@@ -35,7 +35,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.points import Mount, Scan
 from l1slam_ros.io.bounded import check_unpacked
-from l1slam_ros.io.files import counted
+from l1slam_ros.io.files import LARGEST, counted, stamp_from_text
 from l1slam_ros.io.scans.laser_log import LaserLog
 from l1slam_ros.io.scans.log_stamps import rising
 
@@ -182,8 +182,8 @@ def _line(words: list[bytes], count: int, start: float, step: float, farthest: f
     first = count + skipped
     ranges = np.array(words[:count], float)
     poses = np.array(words[first : first + 6], float)
-    stamp = float(words[first + 6 + after])
-    if count < 2 or len(poses) < 6 or not np.isfinite([*poses, stamp]).all():
+    stamp = stamp_from_text(words[first + 6 + after].decode())
+    if count < 2 or len(poses) < 6 or not (abs(poses) <= LARGEST).all():
         raise ValueError
-    return _Line(Scan(round(stamp * 1e9), ranges, start, step, 0.0, farthest), poses[:3],
+    return _Line(Scan(stamp, ranges, start, step, 0.0, farthest), poses[:3],
                  poses[3:])
