@@ -103,6 +103,8 @@ KINDS = (
     Kind('g2o in space', 'space', 'graph.g2o', damaged='graph.g2o'),
     Kind('g2o with all else', 'extra', 'graph.g2o', damaged='graph.g2o'),
     Kind('solved g2o', 'solved', 'graph.g2o', damaged='graph.g2o'),
+    Kind('g2o without information', 'bare', 'graph.g2o', tuple(
+        f'{words} --information {x}' for words in _ALL for x in (25, 1e-25, 1e-9, 1e9, 1e28))),
     Kind('TORO', 'toro', 'graph.graph'),
     Kind('packed g2o', 'packed', 'graph.g2o.gz'),
     Kind('packed TORO', 'packed_toro', 'graph.toro.bz2'),
@@ -160,6 +162,8 @@ def write_kinds(folder: Path) -> None:
     with (folder / 'space/graph.g2o').open('a') as file:
         file.write(_SPACE)
     (folder / 'extra/graph.g2o').write_text(plane + _EXTRA)
+    (folder / 'bare/graph.g2o').write_text(''.join(
+        f'{" ".join(line.split()[:6])}\n' for line in plane.splitlines()))
     run('solve {f}/extra/graph.g2o --output {f}/solved/graph.g2o --quiet')
     for suffix, name in (('jrl', 'plane'), ('jrl3', 'space')):
         run(f'convert {{f}}/{name}/graph.g2o {{f}}/{suffix}/graph.jrl')
