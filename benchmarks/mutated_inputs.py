@@ -13,9 +13,10 @@ Damaged inputs of every kind that is read: each ends in order, in little time an
                                         [--only NUMBER] [--keep FOLDER]
 
 Small inputs of each kind are written and damaged at random: bytes, numbers, fields, lines, cells
-of a database, messages. A random command then reads one in a process of its own. It may end with 0,
-2, 3 or 4, with one line that says why for 2, within 20 s and 1 GiB, and without a traceback or a warning of
-Python. Printed is a table by kind, and how each failure is repeated; then the exit code is 1.
+of a database, messages. A random command then reads one in a process of its own. It may end with
+0, 2, 3 or 4, for 2 with a line that says why, within 20 s and 1 GiB, and without a traceback or a
+warning of Python. Printed is each failure, with what repeats it, and a table by kind; the exit
+code is 1 if there was one.
 """
 
 import argparse
@@ -82,7 +83,7 @@ def main() -> int:
 
 
 def _in_silence(work) -> None:
-    """Do some work of this process without what it prints; what it loads, children have at once."""
+    """Do some work without what it prints; what it loads, the children have from the start."""
     kept = os.dup(2)
     with open(os.devnull, 'w') as nothing:
         os.dup2(nothing.fileno(), 2)
@@ -123,8 +124,9 @@ def _all(numbers, asked: argparse.Namespace, sound: Path, work: Path) -> list[Ru
     return found
 
 
-def _prepared(rng: np.random.Generator, sound: Path, folder: Path) -> tuple[Kind, tuple[str, ...]]:
-    """Make a damaged input in a folder; return its kind and the words of a command that reads it."""
+def _prepared(rng: np.random.Generator, sound: Path,
+              folder: Path) -> tuple[Kind, tuple[str, ...]]:
+    """Make a damaged input in a folder; return its kind, and a command that reads it."""
     kind = KINDS[rng.integers(len(KINDS))]
     shutil.copytree(sound / kind.folder, folder)
     files = sorted(path for path in folder.rglob('*') if path.is_file() and (
@@ -163,7 +165,8 @@ def _load(path: Path) -> int:
     """Go on with a saved map, as the node does; return the exit code that a command would have."""
     try:
         saved, _, _ = load_map(path)
-        with l1.Backend(l1.BackendOptions(), 3 if saved.builder.graph.manifold.NAME == "SE3" else 2) as backend:
+        in_space = saved.builder.graph.manifold.NAME == 'SE3'
+        with l1.Backend(l1.BackendOptions(), 3 if in_space else 2) as backend:
             backend.restore(saved)
             backend.settle()
             backend.loop_states()

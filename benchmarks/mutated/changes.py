@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Damage to files: their bytes, and, in what they hold, numbers, fields, lines, cells, messages."""
+"""Damage to files: to their bytes, numbers, fields, lines, cells of databases, messages."""
 
 import bz2
 import gzip
@@ -29,17 +29,17 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 
-EXTREMES = (b'nan inf -inf 1e308 -1e308 1e-320 1e400 -0 0 1 -1 1e30 1e29 1e15 1e-30 9223372036854775807 '
-            b'9223372036854775808 -9223372036854775809 18446744073709551616 4294967296 2147483648 '
-            b'99999999999999999999999 1000000000 0x10 1_000 null true [] {} "" x - \xd9\xa3 \xff').split()
+EXTREMES = (
+    b'nan inf -inf 1e308 -1e308 1e-320 1e400 -0 0 1 -1 1e30 1e29 1e15 1e-30 9223372036854775807 '
+    b'9223372036854775808 -9223372036854775809 18446744073709551616 4294967296 2147483648 '
+    b'99999999999999999999999 1000000000 0x10 1_000 null true [] {} "" x - \xd9\xa3 \xff').split()
 TAGS = (b'VERTEX_SE2 EDGE_SE2 EDGE_PRIOR_SE2 EDGE_PRIOR_SE2_XY VERTEX_SE3:QUAT EDGE_SE3:QUAT '
         b'EDGE_SE3_PRIOR EDGE_SE3_XYZPRIOR EDGE_SE3_PRIORXY EDGE_SE2_SWITCHABLE VERTEX3 EDGE3 '
         b'VERTEX2 EDGE2 EQUIV PARAMS_SE3OFFSET FIX VERTEX_XY FLASER ROBOTLASER1 #L1SLAM # '
         b'slip rejected suspect EDGE_NEW').split()
-BINARY = (struct.pack('<d', float('nan')), struct.pack('<d', 1e308), struct.pack('<d', -float('inf')),
-          struct.pack('<d', 0.0), struct.pack('<q', 2**63 - 1), struct.pack('<q', -2**63),
-          struct.pack('<I', 2**32 - 1), struct.pack('<I', 2**31), struct.pack('<I', 10**8),
-          struct.pack('<I', 0), struct.pack('<H', 2**16 - 1), struct.pack('<d', 1e15))
+BINARY = (*(struct.pack('<d', value) for value in (np.nan, 1e308, -np.inf, 0.0, 1e15)),
+          *(struct.pack('<q', value) for value in (2**63 - 1, -2**63)),
+          *(struct.pack('<I', value) for value in (2**32 - 1, 2**31, 10**8, 0)), b'\xff\xff')
 CELLS = (None, 0, -1, 2**63 - 1, -2**63, 1e308, 'nan', '', 'x' * 5000, b'', b'\xff' * 100,
          'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped', '/odom', '/loop_closures')
 _NUMBER = re.compile(rb'(?<![\w.])-?\d[\d.]*(?:e[+-]?\d+)?')
@@ -65,7 +65,8 @@ def mutate(path: Path, rng: Random, sound: Path) -> None:
         return
     if '.mcap' in path.name and rng.random() < 0.6:
         packed = path.suffix == '.zstd'
-        made = _mcap(zstandard.ZstdDecompressor().decompressobj().decompress(content) if packed else content, rng)
+        unpack = zstandard.ZstdDecompressor().decompressobj().decompress
+        made = _mcap(unpack(content) if packed else content, rng)
         path.write_bytes(zstandard.compress(made) if packed else made)
         return
     for suffix, library in (('.gz', gzip), ('.bz2', bz2)):
@@ -108,7 +109,7 @@ def _messages(recording: list[tuple], rng: Random) -> list[tuple]:
 
 
 def _mcap(content: bytes, rng: Random) -> bytes:
-    """Write the messages of an MCAP file anew, with some of them damaged and all checksums right."""
+    """Write the messages of an MCAP file anew, some of them damaged and all checksums right."""
     recording = [((schema.name, schema.data, channel.topic), message.log_time, message.data)
                  for schema, channel, message in make_reader(BytesIO(content)).iter_messages()]
     notes = list(make_reader(BytesIO(content)).iter_metadata())
@@ -149,6 +150,8 @@ def _damaged(content: bytes, rng: Random, sound: Path) -> bytes:
     ways: tuple[Callable[[bytes, Random], bytes], ...] = (
         (_numbers, _numbers, _numbers, _fields, _lines, _ranges, _bytes) if is_text
         else (_binary, _binary, _bytes, _ranges))
+    if is_text and rng.random() < 0.4:  # of which most is read
+        return _numbers(content, rng, 1.0)
     for _ in range(rng.choice([1, 1, 1, 2, 3])):
         content = ways[rng.integers(len(ways))](content, rng)
     if sound != Path() and rng.random() < 0.06:
@@ -202,16 +205,17 @@ def _replaced(pattern: re.Pattern[bytes], content: bytes, rng: Random,
     return b''.join((*parts, content[end:]))
 
 
-def _numbers(content: bytes, rng: Random) -> bytes:
+def _numbers(content: bytes, rng: Random, sound: float = 0.5) -> bytes:
+    """Replace numbers; sound : the share of those that remain what they are, ids or decimals."""
     same = EXTREMES[rng.integers(len(EXTREMES))]
     scale = 10 ** rng.uniform(-9, 9)
 
     def new(old: bytes) -> bytes:
         with suppress(ValueError):
-            if old.isdigit() and rng.random() < 0.5:  # of a vertex, a count
+            if old.isdigit() and rng.random() < sound:  # of a vertex, a count
                 return b'%d' % rng.integers(40)
-            if rng.random() < 0.5:
-                return repr(float(old) * scale).encode()
+            if rng.random() < sound:
+                return repr(float(old) * (scale, -1, 0, 1 / scale)[rng.integers(4)]).encode()
         return same if rng.random() < 0.7 else EXTREMES[rng.integers(len(EXTREMES))]
 
     return _replaced(_NUMBER, content, rng, new)

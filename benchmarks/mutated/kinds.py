@@ -127,7 +127,8 @@ KINDS = (
         *(f'{words} --odom-topic /pose_graph' for words in _ALL))),
     Kind('bag of ROS 1', 'ros1', 'bag.bag'),
     Kind('truth', 'plane', 'graph.g2o.truth.txt', (
-        f'{_PLANE} --reference {{input}}', f'{_PLANE} --reference {{input}} --plot {{folder}}/o.png',
+        f'{_PLANE} --reference {{input}}',
+        f'{_PLANE} --reference {{input}} --plot {{folder}}/o.png',
         'plot {folder}/graph.g2o --output {folder}/o.png'), '*.truth.txt'),
     Kind('truth as TUM', 'tum', 'truth.tum', (f'{_PLANE} --reference {{input}}',)),
     Kind('truth as CSV', 'csv', 'truth.csv', (f'{_PLANE} --reference {{input}}',)),
@@ -251,8 +252,8 @@ def _write_bags(folder: Path) -> None:
                 known[topic] = writer.add_connection(topic, msgtype, typestore=ROS1)
             writer.write(known[topic], time, TYPES.cdr_to_ros1(data, msgtype))
     _write_bag(folder / 'pose_graph/bag', [
-        ('/pose_graph', POSE_GRAPH, 10**12, bytes(TYPES.serialize_cdr(_pose_graph(), POSE_GRAPH)))],
-        mcap)
+        ('/pose_graph', POSE_GRAPH, 10**12,
+         bytes(TYPES.serialize_cdr(_pose_graph(), POSE_GRAPH)))], mcap)
 
 
 def _pose_graph() -> object:
