@@ -168,6 +168,12 @@ def _load(path: Path) -> int:
         in_space = saved.builder.graph.manifold.NAME == 'SE3'
         with l1.Backend(l1.BackendOptions(), 3 if in_space else 2) as backend:
             backend.restore(saved)
+            for k in range(5):  # the drive goes on
+                backend.add_odometry(l1.OdometrySample(
+                    (150 + k) * 10**9, np.array((k, 0.0, 0, 0, 0, 0, 1)), *2 * [0.01 * np.eye(6)]))
+            backend.add_loop(l1.LoopClosure(
+                102 * 10**9, 153 * 10**9, np.array((0, 0, 0, 0, 0, 0, 1.0)), 0.01 * np.eye(6)))
+            backend.update()
             backend.settle()
             backend.loop_states()
     except l1.L1SlamError as error:
