@@ -116,17 +116,31 @@ def _blocks(path: Path, most: int, expected: str = '') -> Iterator[bytes]:
             while block := file.read(_BLOCK):
                 yield block
             return
-        left = min(most, max(_MOST_PACKED * size, _LONGEST_YAML))
+        length = 0
         try:
             unpacked = unpack(file)
             while block := unpacked.read(_BLOCK):
-                left -= len(block)
-                if left < 0:
-                    raise FileError(path, f'{size:,} bytes that unpack to more than a graph; '
-                                    f'expected at most {_MOST_PACKED} times as many')
+                length += len(block)
+                check_unpacked(path, size, length, most)
                 yield block
         except (EOFError, OSError, zlib.error) as error:
             raise FileError(path, f'cannot be unpacked: {error}') from error
+
+
+def check_unpacked(path: Path, size: int, unpacked: int, most: int = _LARGEST) -> None:
+    """
+    Refuse a packed file that unpacks to more than any graph or log does.
+
+    size, unpacked, most : its bytes, those that were unpacked by now, and how many these may be
+
+    Raises
+    ------
+    FileError : naming the file.
+
+    """
+    if unpacked > min(most, max(_MOST_PACKED * size, _LONGEST_YAML)):
+        raise FileError(path, f'{size:,} bytes that unpack to more than a graph; expected at most '
+                        f'{_MOST_PACKED} times as many')
 
 
 def read_yaml(text: str) -> Any:

@@ -264,10 +264,10 @@ class RobotOdometry:
         Go on where a run ended.
 
         stamps (k,), odometry (k, p), numbers (k,) : of the robot's keyframes; firsts : keyframes
-        with which parts begin
+        with which parts begin; others begin where stamps do not rise, as of several drives
         """
         track = self.track
-        parts = np.flatnonzero(np.isin(numbers[1:], firsts)) + 1
+        parts = np.flatnonzero(np.isin(numbers[1:], firsts) | (np.diff(stamps) <= 0)) + 1
         for part in np.split(np.arange(len(numbers)), parts):
             track.extend_by_part(stamps[part], odometry[part])
         track.numbers.extend(numbers)

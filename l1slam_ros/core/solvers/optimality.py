@@ -270,10 +270,10 @@ class Mixed:
         return [(norm, factors[own].ravel()) for norm, own in self.parts]
 
     def _joined(self, found: list[Array]) -> Array:
-        rows = np.empty(sum(map(len, found)))
+        rows = np.empty((len(self.parts[0][1]), sum(map(len, found)) // len(self.parts[0][1])))
         for (_, own), part in zip(self.parts, found, strict=True):
-            rows.reshape(len(own), -1)[own] = part.reshape(np.count_nonzero(own), -1)
-        return rows
+            rows[own] = part.reshape(-1, rows.shape[1])  # a part may have no factors
+        return rows.ravel()
 
 
 @dataclass(frozen=True)

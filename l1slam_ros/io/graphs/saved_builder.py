@@ -32,6 +32,7 @@ Limits = tuple[str, np.ndarray, tuple[int, ...], tuple[float, float]]
 ANY = -np.inf, np.inf
 FINITE = -LARGEST, LARGEST
 _ROBOT = 0, 2**31
+_TIME = -(2.0**62), 2.0**62  # [ns]
 # [bytes] Of the key of a loop in `LoopsState.seen`, without its robots.
 _IDENTITY = 16
 
@@ -81,6 +82,11 @@ def limits_of(state: BuilderState) -> Iterator[Limits]:
     graph, loops, robots = state.graph, state.loops, np.unique(state.graph.robot)
     n, m = len(state.stamps), len(graph.between)
     d, p = graph.manifold.TANGENT_SIZE, graph.manifold.POSE_SIZE
+    yield 'stamps', state.stamps, (n,), ANY
+    for robot in robots:
+        own = state.stamps[graph.robot == robot].astype(float)
+        # Where stamps go back, time goes on.
+        yield 'stamps', own.max() - np.diff(own).clip(max=0).sum(), (), _TIME
     yield 'odometry', _normalised(graph.manifold, state.odometry), (n, p), FINITE
     yield 'keyframe_robots', graph.robot, (n,), _ROBOT
     yield 'robot', np.sort([end.robot for end in state.ends]) - robots, robots.shape, (0, 0)

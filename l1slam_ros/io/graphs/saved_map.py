@@ -15,7 +15,7 @@ The new file takes its place by one rename. The previous one stays beside it, as
 import glob
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -33,7 +33,6 @@ from l1slam_ros.io.files import LARGEST, other_kind, put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph_file
 from l1slam_ros.io.graphs.left_out import SUSPECT, left_out_by
 from l1slam_ros.io.graphs.saved_builder import (
-    ANY,
     FINITE,
     Limits,
     limits_of,
@@ -180,20 +179,21 @@ def _read(path: Path) -> SavedMap:
     state = BuilderState.of_graph(record.graph, record.poses, record.stamps)
     optimised = Optimised.nothing(record.poses)
     values = dict(record.remarks or {})
-    if not values:
-        return SavedMap(state, optimised, Judgement.nothing(), True)
     with wrong_contents(path):
+        if not values:
+            _require_within(limits_of(state))
+            return SavedMap(state, optimised, Judgement.nothing(), True)
         doubts = tuple(
             Doubt(**doubt | {'pairs': tuple((i, j) for i, j in doubt.get('pairs', ()))})
             for doubt in values['doubts'])
         judgement = _restored(Judgement.nothing(), values | {'doubts': doubts})
         saved = SavedMap(restored(state, values), _restored(optimised, values), judgement,
                          values['robust'], robots=tuple(values.get('robots', ())))
-        _require_sound(saved)
+        _require_within((*limits_of(saved.builder), *_limits(saved)))
     return saved
 
 
-def _require_sound(saved: SavedMap) -> None:
+def _require_within(limits: Iterable[Limits]) -> None:
     """
     Check the sizes and ranges of what a file holds, before a back end goes on with it.
 
@@ -202,7 +202,7 @@ def _require_sound(saved: SavedMap) -> None:
     ValueError : naming a value that cannot be that of a map.
 
     """
-    for name, values, shape, (low, high) in (*limits_of(saved.builder), *_limits(saved)):
+    for name, values, shape, (low, high) in limits:
         if values.shape != shape or not ((values >= low) & (values <= high)).all():
             raise ValueError(f'{name} is no array {shape} of values from {low:g} to {high:g}')
 
@@ -212,7 +212,6 @@ def _limits(saved: SavedMap) -> Iterator[Limits]:
     optimised, judgement, graph = saved.optimised, saved.judgement, saved.builder.graph
     n, m, d = len(optimised.poses), len(graph.between), graph.manifold.TANGENT_SIZE
     judged, size = (min(len(judgement.accepted), m),), (0, np.inf)
-    yield 'stamps', saved.builder.stamps, (n,), ANY
     yield 'dual', optimised.dual, (m * d,), FINITE
     yield 'cost', np.array(optimised.cost), (), size
     yield 'accepted', judgement.accepted, judged, (False, True)

@@ -22,6 +22,7 @@ the robot by wheel odometry, and the stamp of the message [s]. A range may be Na
 import bz2
 import gzip
 import math
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +34,8 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.points import Mount, Scan
-from l1slam_ros.io.files import counted
+from l1slam_ros.io.bounded import check_unpacked
+from l1slam_ros.io.files import LARGEST, counted, stamp_from_text
 from l1slam_ros.io.scans.laser_log import LaserLog
 from l1slam_ros.io.scans.log_stamps import rising
 
@@ -133,13 +135,16 @@ def _farthest(scans: list[Scan]) -> float:
 def _lines(path: Path, damage: list[str]) -> Iterator[tuple[int, bytes]]:
     """Yield the lines with their numbers; append to `damage` if the file ends too early."""
     opened = _OPEN.get(path.suffix.lower(), Path.open)
-    number = 0
+    number = unpacked = 0
+    size = path.stat().st_size
     try:
         with opened(path, 'rb') as file:
             while line := file.readline(_LONGEST):
                 number += 1
+                unpacked += len(line)
+                check_unpacked(path, size, unpacked)
                 yield number, line
-    except (OSError, EOFError) as error:
+    except (OSError, EOFError, zlib.error) as error:
         if not number:
             raise FileError(path, f'cannot be read: {error}') from error
         damage.append(f'cannot be read beyond line {number:,}: {error}')
@@ -177,8 +182,8 @@ def _line(words: list[bytes], count: int, start: float, step: float, farthest: f
     first = count + skipped
     ranges = np.array(words[:count], float)
     poses = np.array(words[first : first + 6], float)
-    stamp = float(words[first + 6 + after])
-    if count < 2 or len(poses) < 6 or not np.isfinite([*poses, stamp]).all():
+    stamp = stamp_from_text(words[first + 6 + after].decode())
+    if count < 2 or len(poses) < 6 or not (abs(poses) <= LARGEST).all():
         raise ValueError
-    return _Line(Scan(round(stamp * 1e9), ranges, start, step, 0.0, farthest), poses[:3],
+    return _Line(Scan(stamp, ranges, start, step, 0.0, farthest), poses[:3],
                  poses[3:])

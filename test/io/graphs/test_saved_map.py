@@ -228,7 +228,8 @@ def numbers(*values, kind='<f8'):
 
 # Values of a map of six keyframes in a row, which begin one of its comment lines.
 WRONG = {
-    'stamps': ('', numbers(1, 2, kind='<i8'), '"x"', 'nonsense', numbers(*[np.nan] * 6)),
+    'stamps': ('', numbers(1, 2, kind='<i8'), '"x"', 'nonsense', numbers(*[np.nan] * 6),
+               numbers(*[0, 2**62] * 3, kind='<i8')),
     'odometry': (numbers(0, 0, 0), numbers(*[np.nan] * 18), numbers(*[1e300] * 18)),
     'offset': ('[]', '[null]', numbers(0, 0)),
     'end': ('null', '"x"', '1e300', '99999999999999999999'),
@@ -276,6 +277,18 @@ def test_where_the_contents_are_wrong_the_map_before_is_taken(two, capsys, name)
         load_map(two)
     main(['info', str(two)])
     assert 'Traceback' not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('stamps', [[0] * 6, [9, 8, 7, 6, 6, 6]])
+def test_a_part_begins_where_saved_stamps_do_not_rise(two, stamps):
+    hold(two, 'stamps', numbers(*stamps, kind='<i8'))
+    hold(two, 'end', str(stamps[-1]))
+    backend = Backend(EVERY)
+    with np.errstate(all='raise'):
+        backend.restore(load_map(two)[0])
+        backend.add_odometry(odometry(20.0, (1.0, 2.0, 0.0)))
+        settle(backend)
+    assert backend.poses.shape == (7, 3) and np.isfinite(backend.poses).all()
 
 
 def test_what_is_missing_is_noticed_and_the_map_before_taken(two):

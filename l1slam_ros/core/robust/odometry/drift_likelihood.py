@@ -73,6 +73,8 @@ def likely_drifts(graph: FactorGraph) -> Array:
     rows = rows[:: max(1, len(rows) // ASKED)]
     likelihood = _DriftLikelihood(bridged(graph), rows)
     drifts = likelihood.peaks()
+    if not len(drifts):  # of noise so large that none is likelier than the next
+        return drifts
     values = np.array([likelihood.value(drift, USUAL**2) for drift in drifts])
     most = values.max()
     if likelihood.value(0.0, 0.0) >= _NONE * most:

@@ -1,0 +1,70 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""Damaged inputs that benchmarks/mutated_inputs.py once found to end in disorder."""
+
+import gzip
+
+import pytest
+from command import run, solve_json
+
+SCAN = 'FLASER 4 1 2 3 4 {k}.04 2 0 {k} 2 0 {k} host 0.1\n'
+
+
+def log(count):
+    return ''.join(SCAN.format(k=k) for k in range(count)).encode()
+
+
+def refused(capsys, *arguments):
+    """Return the only line that a refused command prints."""
+    out, err = run(capsys, *arguments, code=2)
+    assert out == '' and err.count('\n') == 1 and err.startswith('l1slam: '), err
+    return err
+
+
+def test_a_packed_log_with_a_damaged_block_is_used_up_to_there(capsys, tmp_path):
+    packed = bytearray(gzip.compress(log(2000), 1))
+    packed[len(packed) // 2:len(packed) // 2 + 40] = b'\xff' * 40
+    path = tmp_path / 'log.gz'
+    path.write_bytes(packed)
+    _, err = run(capsys, 'info', path, code=3)
+    assert 'cannot be read beyond line' in err and err.count('\n') == 1
+    path.write_bytes(packed[:12] + b'\xff' * 100)
+    assert 'log.gz: cannot be read: ' in refused(capsys, 'info', path)
+
+
+def test_a_packed_log_without_end_is_refused(capsys, tmp_path):
+    path = tmp_path / 'log.gz'
+    path.write_bytes(gzip.compress(b'PARAM ' * 2**20 + b'\n', 9) + gzip.compress(log(3)))
+    assert 'bytes that unpack to more than a graph' in refused(capsys, 'info', path)
+
+
+@pytest.mark.parametrize('stamp', ['1e300', '1e11', '9223372037', 'nan'])
+def test_a_scan_of_a_stamp_that_no_clock_has_is_left_out(capsys, tmp_path, stamp):
+    path = tmp_path / 'log.clf'
+    path.write_bytes(log(40) + SCAN.format(k=7).replace(' 7 host', f' {stamp} host').encode())
+    _, err = run(capsys, 'info', path, code=3)
+    assert 'line 41: expected FLASER' in err and err.count('\n') == 1
+
+
+@pytest.mark.parametrize('norm', ['l2', 'huber', 'group-l1'])
+def test_a_drive_without_a_loop_has_a_norm_for_loops(capsys, tmp_path, norm):
+    path = tmp_path / 'drive.g2o'
+    path.write_text(''.join(f'EDGE_SE2 {k} {k + 1} 1 0 .1 9 0 0 9 0 9\n' for k in range(9)))
+    report = solve_json(capsys, path, '--loop-norm', norm)
+    assert report['status'] == 'converged' and report['final_cost'] < 1e-6
+
+
+@pytest.mark.parametrize('information', ['1e-20', '1e-30', '1e30'])
+def test_any_information_that_is_read_can_be_given(capsys, tmp_path, information):
+    path = tmp_path / 'bare.g2o'
+    ends = [(k, k + 1) for k in range(39)] + [(k, k + 20) for k in range(0, 19, 3)]
+    path.write_text(''.join(
+        f'EDGE_SE2 {i} {j} {int(j - i == 1)} 0 {1.5708 if j - i == 1 and i % 5 == 4 else 0}\n'
+        for i, j in ends))
+    assert solve_json(capsys, path, '--information', information, code=None)['poses'] == 40
