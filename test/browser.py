@@ -52,9 +52,18 @@ _ACT = """<script>
   if (parent !== window) parent.postMessage(made.outerHTML, '*');
 }})();
 </script>"""
-# No window of a browser is as narrow as a phone; a frame in it is.
-_FRAME = """<!DOCTYPE html><body><iframe src="page.html" width="{width}" height="844"></iframe>
-<script>addEventListener('message', event => document.body.innerHTML = event.data);</script>"""
+# No window of a browser is as narrow as a phone; a frame in it is. And one browser opens several
+# pages sooner than several browsers.
+_FRAMES = """<!DOCTYPE html><body>{frames}
+<script>
+const found = new Map(), frames = [...document.querySelectorAll('iframe')];
+addEventListener('message', event => {{
+  found.set(frames.findIndex(one => one.contentWindow === event.source), event.data);
+  if (found.size === frames.length)
+    document.body.innerHTML = frames.map((one, k) => found.get(k)).join('');
+}});
+</script>"""
+_FRAME = '<iframe src="page{number}.html" width="{width}" height="844"></iframe>'
 
 
 def browser():
@@ -72,20 +81,34 @@ def opened(page, script, width=0):
 
     width : of a frame that the page is in, in pixels; 0: it is as wide as the window
     """
-    text = page.read_text(encoding='utf-8')
-    assert text.count('<head>') == text.count('</body>\n</html>') == 1
-    text = text.replace('<head>', f'<head>{_WATCH}', 1).replace(
-        '</body>\n</html>', f'{_ACT.format(script=script)}</body>\n</html>', 1)
+    return _opened([page], script, width)[0]
+
+
+def opened_together(pages, script):
+    """Open copies of pages beside each other in one browser, see `opened`; return a list."""
+    return _opened(pages, script, 1400)
+
+
+def _opened(pages, script, width):
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        for name, content in ('page', text), ('frame', _FRAME.format(width=width)):
-            with open(f'{folder}/{name}.html', 'w', encoding='utf-8') as file:
-                file.write(content)
-        shown = 'frame' if width else 'page'
+        frames = ''.join(_FRAME.format(number=k, width=width) for k in range(len(pages)))
+        copies = {f'page{k}.html': _acting(page, script) for k, page in enumerate(pages)}
+        for name, text in {**copies, 'frames.html': _FRAMES.format(frames=frames)}.items():
+            with open(f'{folder}/{name}', 'w', encoding='utf-8') as file:
+                file.write(text)
+        shown = 'frames' if width else 'page0'
         ran = subprocess.run(
             [browser(), *_OPTIONS, f'--user-data-dir={folder}/profile',
              '--virtual-time-budget=30000', '--dump-dom', f'file://{folder}/{shown}.html'],
             capture_output=True, text=True, timeout=_DEADLINE)
-    found = re.search(r'<pre id="found-by-the-test">(.*?)</pre>', ran.stdout, re.DOTALL)
-    assert found, f'{ran.stdout[-500:]}\n{ran.stderr[-2000:]}'
-    complaints, value = json.loads(html.unescape(found[1]))
-    return value, complaints
+    found = re.findall(r'<pre id="found-by-the-test">(.*?)</pre>', ran.stdout, re.DOTALL)
+    assert len(found) == len(pages), f'{ran.stdout[-500:]}\n{ran.stderr[-2000:]}'
+    return [tuple(reversed(json.loads(html.unescape(one)))) for one in found]
+
+
+def _acting(page, script):
+    """Return the text of a page that runs a script once it is open."""
+    text = page.read_text(encoding='utf-8')
+    assert text.count('<head>') == text.count('</body>\n</html>') == 1
+    return text.replace('<head>', f'<head>{_WATCH}', 1).replace(
+        '</body>\n</html>', f'{_ACT.format(script=script)}</body>\n</html>', 1)
