@@ -6,112 +6,75 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Bags in: messages, raw or decoded, in order of time; a summary, a note; what is no bag."""
+"""What is in a bag is listed; what is no bag is named."""
 
 import pytest
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag1 import Writer as Rosbag1Writer
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Rosbag2Writer
-from rosbags.typesys import Stores, get_typestore
+from command import run
+from mcap.writer import Writer as McapWriter
+from records import error_of
+from rosbags.rosbag2 import StoragePlugin, Writer
+from worlds import simulated_bag
 
-from bags import NOTED, STRING, TYPES, write_strings
-from l1slam_ros.core.errors import FileError
-from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note, read_raw
-from l1slam_ros.io.bags.writer import new_bag
-from l1slam_ros.io.messages.serialisation import cdr, string_bytes
+import l1slam_ros as l1
+from bags import STRING, TYPES
 
 
-@pytest.fixture
-def bag(tmp_path):
-    return write_strings(tmp_path / 'bag')
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return simulated_bag(tmp_path_factory.mktemp('world') / 'bag', 5, 5)
 
 
-def test_messages_come_in_order_of_time(bag):
-    messages = list(read_messages(bag))
-    assert [m.topic for m in messages] == ['/a', '/b', '/a', '/a', '/a', '/a']
-    assert [m.time // 10**9 for m in messages] == [10, 11, 12, 14, 16, 18]
-    assert messages[1].data.data == 'b'
-    assert messages[1].msgtype == STRING
-    assert [m.data.data for m in read_messages(bag, ['/b', '/not_there'])] == ['b']
-
-
-def test_a_part_of_the_time(bag):
-    part = read_raw(bag, start=11 * 10**9, stop=14 * 10**9)
-    assert [m.time // 10**9 for m in part] == [11, 12]
-
-
-def test_summary(bag):
+def test_summary(capsys, bag):
     for path in (bag, bag / 'bag.mcap'):
-        summary = bag_summary(path)
-        assert [(t.name, t.msgtype, t.count) for t in summary.topics] == [
-            ('/a', STRING, 5), ('/b', STRING, 1)]
-        assert summary.start == 10 * 10**9
-        assert summary.duration == 8 * 10**9
-        assert summary.note == NOTED
+        assert run(capsys, 'info', path)[0].splitlines()[:4] == [
+            'duration    0.4 s from 1000.000000000',
+            'note        covariance increment, keyframes every',
+            'topic       /loop_closures: 1 of geometry_msgs/msg/PoseWithCovarianceStamped',
+            'topic       /odom: 5 of nav_msgs/msg/Odometry']
 
 
-def test_summary_says_what_was_kept_for_who_comes_late(tmp_path):
-    time = QosTime(0, 0)
-    profiles = [Qos(QosHistory.KEEP_LAST, 3, QosReliability.RELIABLE, durability, time, time,
-                    QosLiveliness.AUTOMATIC, time, False)
-                for durability in (QosDurability.TRANSIENT_LOCAL, QosDurability.VOLATILE)]
-    with Rosbag2Writer(tmp_path / 'two', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        for name, offered in (('/grid', profiles), ('/said', profiles[1:])):
-            to = writer.add_connection(name, STRING, typestore=TYPES, offered_qos_profiles=offered)
-            writer.write(to, 1, cdr((4, string_bytes('a'))))
-    for path in tmp_path / 'two', tmp_path / 'two' / 'two.mcap':
-        assert {t.name: t.kept for t in bag_summary(path).topics} == {'/grid': 3, '/said': 0}
-    with Rosbag1Writer(tmp_path / 'one.bag') as writer:
-        for latching in 0, 1:
-            writer.add_connection(f'/{latching}', STRING, typestore=get_typestore(
-                Stores.ROS1_NOETIC), latching=latching)
-    assert {t.name: t.kept for t in bag_summary(tmp_path / 'one.bag').topics} == {'/0': 0, '/1': 1}
+def test_an_empty_bag(capsys, tmp_path):
+    with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        writer.add_connection('/a', STRING, typestore=TYPES)
+    with (tmp_path / 'a.mcap').open('wb') as stream:
+        writer = McapWriter(stream)
+        writer.start('ros2')
+        writer.register_channel('/a', 'cdr', writer.register_schema(STRING, 'ros2msg', b''))
+        writer.finish()
+    for path in tmp_path / 'bag', tmp_path / 'a.mcap':
+        out, err = run(capsys, 'info', path, code=2)
+        assert 'duration    0.0 s from 0.000000000\nnote        none of l1slam' in out
+        assert f'topic       /a: 0 of {STRING}\n' in out
+        assert err == f'l1slam: {path}: 0 keyframes from /odom; expected 2 or more\n'
 
 
-def test_an_empty_bag(tmp_path):
-    with new_bag(tmp_path / 'bag', {}) as writer:
-        writer.add_topic('/a', STRING)
-    summary = bag_summary(tmp_path / 'bag')
-    assert (summary.start, summary.duration, summary.note) == (0, 0, {})
-    assert list(read_messages(tmp_path / 'bag')) == []
-
-
-def error_of(call, *arguments):
-    with pytest.raises(FileError) as caught:
-        list(call(*arguments))
-    assert '\n' not in str(caught.value)
-    return str(caught.value)
-
-
-def test_what_is_no_bag_is_told(tmp_path, bag):
+def test_what_is_no_bag_is_told(capsys, tmp_path, bag):
     (tmp_path / 'a.txt').write_text('x')
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'two').mkdir()
     for name in 'a_0.mcap', 'b_0.mcap':
         (tmp_path / 'two' / name).write_bytes((bag / 'bag.mcap').read_bytes())
-    for call in (read_messages, read_raw, bag_summary, read_note):
-        assert error_of(call, tmp_path / 'none').endswith(': no such file or directory; '
-                                                          'expected a bag')
-        assert 'not have the name of a bag; expected .mcap, .db3' in error_of(
-            call, tmp_path / 'a.txt')
-        for name, count in ('empty', 0), ('two', 2):
-            assert (f'without metadata.yaml and with the files of {count} bags'
-                    in error_of(call, tmp_path / name))
-    assert list(read_messages(bag, ['/odom'])) == []
+
+    def errors_of(path):
+        yield error_of(l1.read_graph, path)
+        said = run(capsys, 'info', path, code=2)[1]
+        assert said.count('\n') == 1
+        yield said
+
+    assert all(': no such file or directory; expected a' in said
+               for said in errors_of(tmp_path / 'none'))
+    assert all('unknown kind of file; expected .g2o, ' in said and ' .mcap, .db3' in said
+               for said in errors_of(tmp_path / 'a.txt'))
+    for name, count in ('empty', 0), ('two', 2):
+        for said in errors_of(tmp_path / name):
+            assert f'without metadata.yaml and with the files of {count} bags' in said
 
 
 @pytest.mark.parametrize('content', [b'', b'x', b'\x89MCAP0\r\n', b'\x00' * 5000])
 @pytest.mark.parametrize('suffix', ['.mcap', '.db3'])
-def test_a_file_that_is_no_bag(tmp_path, content, suffix):
+def test_a_file_that_is_no_bag(capsys, tmp_path, content, suffix):
     path = tmp_path / f'a{suffix}'
     path.write_bytes(content)
-    assert error_of(read_messages, path).startswith(f'{path}: damaged, or not a bag (')
-    assert error_of(bag_summary, path).startswith(f'{path}: damaged, or not a bag (')
+    assert error_of(l1.read_graph, path).startswith(f'{path}: damaged, or not a bag (')
+    said = run(capsys, 'info', path, code=2)[1]
+    assert said.startswith(f'l1slam: {path}: damaged, or not a bag (') and said.count('\n') == 1
