@@ -58,14 +58,17 @@ def recording_of(bag):
         return [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
 
 
-def write_mcap(stream, recording, ends=None, defined=True, **options):
+def write_mcap(stream, recording, ends=None, defined=True, note=None, **options):
     """
     Write with the mcap library.
 
-    ends : gets where the file ends after each message; defined : whether definitions are written
+    ends : gets where the file ends after each message; defined : whether definitions are written;
+    note : what l1slam notes before the messages
     """
     writer = McapWriter(stream, **options)
     writer.start('ros2', 'test')
+    if note:
+        writer.add_metadata('l1slam', note)
     channels = {}
     for topic, msgtype, time, data in recording:
         if topic not in channels:

@@ -14,6 +14,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from command import run
 
 import l1slam_ros as l1
 
@@ -69,6 +70,51 @@ class Record:
             return None
         assert [int(number) for number, _ in found] == self.ids.tolist()
         return np.array([int(text.replace('.', '')) for _, text in found])
+
+
+# Every message a keyframe, with the covariance it states: as the note of our bags has it.
+EVERY = """\
+/**:
+  ros__parameters:
+    keyframe: {translation: 0.0, rotation: 0.0, period: 0.0}
+    odometry: {covariance_source: increment}
+"""
+
+
+class Converted:
+    """
+    A bag as the graph that `l1slam convert` writes into a folder.
+
+    every : by EVERY, else by the bag's note; code : that the command must end with; None: any
+    content : of the graph and of its stamps; vertices, edges : lines of the graph; skipped : what
+    is said on standard error
+
+    Raises
+    ------
+    L1SlamError : there is no graph
+
+    """
+
+    def __init__(self, capsys, folder, path, every=False, code=0):
+        graph, options = folder / 'out.g2o', ()
+        if every:
+            (folder / 'every.yaml').write_text(EVERY)
+            options = ('--params-file', folder / 'every.yaml')
+        graph.unlink(missing_ok=True)
+        _, err = run(capsys, 'convert', path, graph, *options, code=code)
+        if not graph.exists():
+            raise l1.L1SlamError(err)
+        self.path = graph
+        self.skipped = tuple(line.removeprefix('l1slam: ') for line in err.splitlines())
+        self.content = graph.read_bytes(), beside(graph, 'stamps').read_bytes()
+        lines = graph.read_text().splitlines()
+        self.vertices = [line for line in lines if line.startswith('VERTEX')]
+        self.edges = [line for line in lines if line.startswith('EDGE')]
+
+    @cached_property
+    def graph(self):
+        """The graph, as long as no other bag is converted into the folder."""
+        return read(self.path).graph
 
 
 def read(path, **options):

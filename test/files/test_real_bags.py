@@ -11,7 +11,7 @@
 import numpy as np
 import pytest
 from command import run
-from records import beside, read
+from records import Converted, beside, read
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from worlds import simulated_bag
@@ -22,31 +22,6 @@ from l1slam_ros.cli.main import main
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
 SECOND = 10**9
-# Every message a keyframe, with the covariance it states: as the note of our bags has it.
-EVERY = """\
-/**:
-  ros__parameters:
-    keyframe: {translation: 0.0, rotation: 0.0, period: 0.0}
-    odometry: {covariance_source: increment}
-"""
-
-
-class Converted:
-    """
-    A bag as the graph that `l1slam convert` writes.
-
-    content : of the graph and of its stamps; skipped : what is said on standard error
-    """
-
-    def __init__(self, capsys, folder, path, every):
-        graph, options = folder / 'out.g2o', ()
-        if every:
-            (folder / 'every.yaml').write_text(EVERY)
-            options = ('--params-file', folder / 'every.yaml')
-        _, err = run(capsys, 'convert', path, graph, *options)
-        self.content = graph.read_bytes(), beside(graph, 'stamps').read_bytes()
-        self.skipped = tuple(line.removeprefix('l1slam: ') for line in err.splitlines())
-        self.graph = read(graph).graph
 
 
 @pytest.fixture
