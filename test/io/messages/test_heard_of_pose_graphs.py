@@ -79,6 +79,15 @@ def test_a_pose_graph_tells_the_times_and_whose_they_are(truth):
         edge(1, 6, LOOPCLOSE, truth, robots=(1, 1))], robot=1)) == ([], [])
 
 
+@pytest.mark.parametrize('keys', [(6, 2**63), (2**64 - 1, 2**63)])
+def test_a_key_beyond_63_bits_is_refused_by_its_cause(truth, keys):
+    truth = {k - 1: pose for k, pose in enumerate(truth, 1)} | {
+        key - 1: truth[0] for key in keys[-1:] + keys[:1] if key > 6}
+    message = pose_graph(20, [(k, 9.0) for k in (*range(1, 7), *keys)], [
+        *(edge(k, k + 1, ODOM, truth) for k in range(1, 6)), edge(*keys, LOOPCLOSE, truth)])
+    assert taken(PoseGraphs(), message)[1] == ['number']
+
+
 @pytest.fixture
 def bag(tmp_path, truth):
     """A bag with odometry, and the graphs of RTAB-Map and of pose_graph_tools."""
