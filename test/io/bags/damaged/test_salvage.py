@@ -11,7 +11,7 @@
 import pytest
 from worlds import simulated_bag
 
-from bags import KINDS, recording_of
+from bags import KINDS, mcap_file, recording_of
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.io.bags.bag_files import storage_files
 from l1slam_ros.io.bags.damaged.salvage import Salvage
@@ -47,3 +47,16 @@ def test_damage_is_an_error_to_who_wants_no_part(tmp_path, bag):
     for call in (read_messages, read_raw):
         with pytest.raises(L1SlamError, match='a.mcap is damaged: it breaks off after 5,000 b'):
             list(call(path))
+
+
+def test_a_message_that_cannot_be_decoded_is_an_error_to_who_wants_no_part(tmp_path, recording):
+    broken = list(recording)
+    for k in (20, 30):
+        broken[k] = (*broken[k][:3], broken[k][3][:40])
+    path = mcap_file(tmp_path / 'a.mcap', broken)
+    said = []
+    times = [m.time for m in read_messages(path, None, said.append)]
+    assert times == [m[2] for k, m in enumerate(recording) if k not in (20, 30)]
+    assert said == [f'{path} is damaged: 2 messages cannot be decoded; 299 others were used']
+    with pytest.raises(L1SlamError, match='2 messages cannot be decoded; 299 others were used'):
+        list(read_messages(path))
