@@ -10,6 +10,7 @@
 
 import numpy as np
 import pytest
+from command import run
 from numpy.testing import assert_allclose
 from records import beside, error_of, information_of, read
 
@@ -183,10 +184,17 @@ def test_what_is_no_graph_is_told(write, content, message):
     assert len(found) < 400
 
 
-def test_no_file_and_a_directory(tmp_path):
+def test_no_file_and_a_directory(capsys, tmp_path):
     assert message_of(tmp_path / 'none.g2o').startswith(': no such file or directory; expected a')
     (tmp_path / 'a.g2o').mkdir()
     assert 'with the files of 0 bags' in message_of(tmp_path / 'a.g2o')
+    graph = tmp_path / 'b.g2o'
+    graph.write_text(SQUARE)
+    for reference in tmp_path, tmp_path / 'a.g2o':
+        said = run(capsys, 'solve', graph, '--reference', reference, code=2)[1]
+        assert said == f'l1slam: {reference}: cannot be read: Is a directory\n'
+    beside(graph, 'stamps').mkdir()
+    assert message_of(graph) == '.stamps.txt: cannot be read: Is a directory'
 
 
 def triangle(information):
