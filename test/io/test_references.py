@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""References of three kinds: keys, whether they are stamps, and whole poses with their headings."""
+"""References of three kinds: keys, whether they are stamps, and poses with headings."""
 
 import numpy as np
 import pytest

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps as text: no nanosecond is lost up to the last stamp of 64 bits, which no file may hold."""
+"""Stamps as text: no nanosecond is lost up to the last stamp of 64 bits."""
 
 import numpy as np
 import pytest
