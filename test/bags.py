@@ -24,9 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.from_graph import write_graph_bag
-from l1slam_ros.io.bags.writer import new_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.messages.serialisation import cdr, string_bytes
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 NOTE = '{keyframes: every, covariance: increment}'
@@ -41,31 +39,23 @@ def write_world(path, poses, edges, seed=0):
     return record
 
 
-def write_strings(path, count=5):
-    """Write a bag with `count` long strings on /a, one every other second, and one on /b."""
-    with new_bag(path, NOTED) as writer:
-        writer.add_topic('/a', STRING)
-        writer.add_topic('/b', STRING)
-        for k in range(count):
-            writer.write('/a', (10 + 2 * k) * 10**9, cdr((4, string_bytes(f'a{k}' * 50))))
-        writer.write('/b', 11 * 10**9, cdr((4, string_bytes('b'))))
-    return path
-
-
 def recording_of(bag):
     """Return topic, type, time and CDR of each message, read by rosbags."""
     with AnyReader([bag]) as reader:
         return [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
 
 
-def write_mcap(stream, recording, ends=None, defined=True, **options):
+def write_mcap(stream, recording, ends=None, defined=True, note=None, **options):
     """
     Write with the mcap library.
 
-    ends : gets where the file ends after each message; defined : whether definitions are written
+    ends : gets where the file ends after each message; defined : whether definitions are written;
+    note : what l1slam notes before the messages
     """
     writer = McapWriter(stream, **options)
     writer.start('ros2', 'test')
+    if note:
+        writer.add_metadata('l1slam', note)
     channels = {}
     for topic, msgtype, time, data in recording:
         if topic not in channels:

@@ -13,16 +13,11 @@ import pytest
 from laps import LAP, Laps, late
 from numpy.testing import assert_array_equal
 from problems import hear
+from records import read
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+import l1slam_ros as l1
 from bags import TYPES
-from l1slam_ros.core.errors import MessageError
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.online.graph_builder import GraphBuilder
-from l1slam_ros.core.online.options import GraphBuilderOptions
-from l1slam_ros.io.bags.to_graph import DEFAULT_TOPICS, graph_from_bag
-from l1slam_ros.io.messages.conversion import reference_frame_id
 
 _KINDS = {'/odom': 'nav_msgs/msg/Odometry',
           '/loop_closures': 'geometry_msgs/msg/PoseWithCovarianceStamped'}
@@ -36,8 +31,9 @@ def write(path, found):
                   for name, kind in _KINDS.items()}
         for k, one in enumerate(found):
             frame, topic = 'odom', '/odom'
-            if isinstance(one, LoopClosure):
-                frame, topic = reference_frame_id('b', one.reference_stamp), '/loop_closures'
+            if isinstance(one, l1.LoopClosure):
+                time = '{}.{:09}'.format(*divmod(one.reference_stamp, 10**9))
+                frame, topic = f'b@{time}', '/loop_closures'
             x, y, z, qx, qy, qz, qw = one.pose3.tolist()
             pose = T['geometry_msgs/msg/PoseWithCovariance'](
                 T['geometry_msgs/msg/Pose'](T['geometry_msgs/msg/Point'](x, y, z),
@@ -63,20 +59,23 @@ def test_a_recording_makes_the_graph_that_the_node_makes(tmp_path, fault):
                'silence': lambda: laps.silent(LAP + 7.0, LAP + 11.0),
                'disorder': lambda: late(laps.samples(), 0.2, 1.0, np.random.default_rng(0)),
                }[fault]()
-    found, live = laps.heard(samples), GraphBuilder(se2, GraphBuilderOptions())
+    found, live, refused = laps.heard(samples), l1.Backend(), []
     for one in found:
         try:
             hear(live, [one])
-        except MessageError as error:
-            live.notes.refuse(error.cause, str(error))
-    live.add_due_loops()
+        except l1.L1SlamError as error:
+            refused.append(str(error))
+    now = live.snapshot()
     write(tmp_path / 'bag', found)
-    record = graph_from_bag(tmp_path / 'bag', None, DEFAULT_TOPICS)
-    assert_array_equal(record.stamps, live.keyframe_stamps)
-    ours, theirs = live.graph.between, record.graph.between
+    record = read(tmp_path / 'bag')
+    assert_array_equal(record.stamps, now.stamps)
+    ours, theirs = now.graph.between, record.graph.between
     order = [np.lexsort(factors.pairs.T) for factors in (ours, theirs)]
     assert_array_equal(theirs.pairs[order[1]], ours.pairs[order[0]])
     np.testing.assert_allclose(theirs.sqrt_information[order[1]],
                                ours.sqrt_information[order[0]], rtol=1e-6)
-    assert (len(live.robots[0].track.gaps), len(record.skipped)) == {
-        'restart': (1, 1), 'silence': (0, 0), 'disorder': (0, 1)}[fault]
+    news = live.news()
+    assert (len(news), bool(refused)) == {
+        'restart': (1, False), 'silence': (0, False), 'disorder': (0, True)}[fault]
+    assert record.skipped == (*news, *(
+        f'{len(refused)} messages refused: {one}' for one in refused[:1]))

@@ -17,6 +17,7 @@ from contextlib import closing
 import pytest
 from command import run
 from rosbags.rosbag2 import CompressionMode
+from worlds import simulated_bag
 
 from bags import (
     MCAP,
@@ -28,7 +29,6 @@ from bags import (
     recording_of,
     ros1_file,
     rosbag2_directory,
-    write_world,
 )
 from l1slam_ros.cli.main import main
 
@@ -38,8 +38,7 @@ POSES = 80
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     path = tmp_path_factory.mktemp('world') / 'bag'
-    write_world(path, POSES, 120)
-    return path
+    return simulated_bag(path, POSES, 120)
 
 
 @pytest.fixture(scope='module')

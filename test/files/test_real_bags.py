@@ -10,59 +10,65 @@
 
 import numpy as np
 import pytest
-from problems import EVERY
+from command import run
+from records import Converted, beside, read
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from worlds import simulated_bag
 
-from bags import KINDS, TYPES, mcap_file, recording_of, rosbag2_directory, write_world
-from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.online.options import GraphBuilderOptions
-from l1slam_ros.io.bags.reader import read_messages, read_raw
-from l1slam_ros.io.bags.to_graph import Topics
-from l1slam_ros.io.formats import read_input
+import l1slam_ros as l1
+from bags import KINDS, TYPES, mcap_file, recording_of, rosbag2_directory
+from l1slam_ros.cli.main import main
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
 SECOND = 10**9
 
 
+@pytest.fixture
+def graph_of(capsys, tmp_path):
+    """Return a function from a bag to it `Converted`; every : by EVERY, else by its note."""
+    return lambda path, every=False: Converted(capsys, tmp_path, path, every)
+
+
 @pytest.fixture(scope='module')
 def world(tmp_path_factory):
-    """Return a bag of this package, its messages and the graph in it."""
-    bag = tmp_path_factory.mktemp('world') / 'bag'
-    write_world(bag, 120, 180)
-    return bag, recording_of(bag), read_input(bag)
+    """Return a bag of this package, its messages, and the graph in it as content of files."""
+    folder = tmp_path_factory.mktemp('world')
+    bag = simulated_bag(folder / 'bag', 120, 180)
+    assert main(['convert', str(bag), str(folder / 'out.g2o')]) == 0
+    return bag, recording_of(bag), ((folder / 'out.g2o').read_bytes(),
+                                    beside(folder / 'out.g2o', 'stamps').read_bytes())
 
 
-def assert_same_graph(record, expected):
-    for name in ('i', 'j', 'measurement', 'sqrt_information'):
-        np.testing.assert_array_equal(getattr(record.graph.between, name),
-                                      getattr(expected.graph.between, name))
-    np.testing.assert_array_equal(record.stamps, expected.stamps)
-    assert (record.skipped, record.damage) == ((), '')
+def assert_same_graph(found, expected):
+    assert found.content == expected
+    assert found.skipped == ()
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_every_kind_is_the_same_recording(tmp_path, world, kind):
+def test_every_kind_is_the_same_recording(tmp_path, capsys, graph_of, world, kind):
     _, recording, expected = world
     path = KINDS[kind](tmp_path, recording)
-    raw = list(read_raw(path))
-    assert [(m.topic, m.msgtype, m.time) for m in raw] == [m[:3] for m in recording]
-    assert [TYPES.deserialize_cdr(m.data, m.msgtype).header.frame_id for m in raw] == [
-        TYPES.deserialize_cdr(data, msgtype).header.frame_id for _, msgtype, _, data in recording]
-    assert_same_graph(read_input(path, EVERY), expected)
+    assert_same_graph(graph_of(path, every=True), expected)
+    said, _ = run(capsys, 'info', path)
+    for topic, msgtype in {message[:2] for message in recording}:
+        count = sum(message[0] == topic for message in recording)
+        assert f'topic       {topic}: {count} of {msgtype}\n' in said
+    first, last = recording[0][2], recording[-1][2]
+    assert f'duration    {(last - first) / 1e9:.1f} s from {first / 1e9:.9f}\n' in said
 
 
 @pytest.mark.parametrize('kind', ['db3', 'directory of db3', 'directory of mcap, file compressed',
                                   'split mcap', 'db3 with a journal'])
-def test_the_note_is_found_in_every_kind_that_can_have_one(tmp_path, world, kind):
-    assert_same_graph(read_input(KINDS[kind](tmp_path, world[1])), world[2])
+def test_the_note_is_found_in_every_kind_that_can_have_one(tmp_path, graph_of, world, kind):
+    assert_same_graph(graph_of(KINDS[kind](tmp_path, world[1])), world[2])
 
 
 @pytest.mark.parametrize('note', [
     'a word', '[1, 2]', '{turned_loops: a -1 99999999999999999999, turned_steps: [3]}'])
-def test_a_note_that_says_nothing_is_none(tmp_path, world, note):
+def test_a_note_that_says_nothing_is_none(tmp_path, graph_of, world, note):
     path = rosbag2_directory(tmp_path / 'a', world[1], StoragePlugin.MCAP, note=note)
-    assert_same_graph(read_input(path, EVERY), world[2])
+    assert_same_graph(graph_of(path, every=True), world[2])
 
 
 def test_a_robot_without_our_note_goes_by_the_defaults_of_the_node(tmp_path, world):
@@ -76,8 +82,7 @@ def test_a_robot_without_our_note_goes_by_the_defaults_of_the_node(tmp_path, wor
         template.pose.pose.position.x = k / 16
         recording.append(('/odom', ODOMETRY, time, bytes(TYPES.serialize_cdr(template, ODOMETRY))))
     path = rosbag2_directory(tmp_path / 'a', recording, StoragePlugin.MCAP, note=None)
-    record = read_input(path)
-    default = GraphBuilderOptions()
+    record, default = read(path), l1.BackendOptions()
     assert np.diff(record.stamps).tolist() == [8 * SECOND // 20] * 20
     steps = record.graph.between.measurement
     np.testing.assert_allclose(steps, [[default.keyframe.translation, 0, 0]] * 20, atol=1e-12)
@@ -90,8 +95,8 @@ def renamed(recording, names):
 
 
 def test_a_topic_asked_for_that_is_not_there_is_an_error(tmp_path, world):
-    with pytest.raises(FileError) as caught:
-        read_input(world[0], None, Topics(loops='/loops'))
+    with pytest.raises(l1.L1SlamError) as caught:
+        l1.read_graph(world[0], loop_topic='/loops')
     assert str(caught.value).endswith(
         'no messages on /loops; expected geometry_msgs/msg/PoseWithCovarianceStamped; '
         'geometry_msgs/msg/PoseWithCovarianceStamped is on /loop_closures')
@@ -99,11 +104,11 @@ def test_a_topic_asked_for_that_is_not_there_is_an_error(tmp_path, world):
 
 def test_a_topic_of_another_type_is_told(tmp_path, world):
     swapped = renamed(world[1], {'/odom': '/loop_closures', '/loop_closures': '/odom'})
-    with pytest.raises(FileError, match=(
+    with pytest.raises(l1.L1SlamError, match=(
             '0 keyframes from /odom.* on /loop_closures; 181 messages refused: '
             'nav_msgs/msg/Odometry on /loop_closures; expected '
             'geometry_msgs/msg/PoseWithCovarianceStamped$')):
-        read_input(mcap_file(tmp_path / 'a.mcap', swapped))
+        l1.read_graph(mcap_file(tmp_path / 'a.mcap', swapped))
 
 
 def test_a_type_defined_otherwise_is_told(tmp_path):
@@ -115,36 +120,36 @@ def test_a_type_defined_otherwise_is_told(tmp_path):
         for k in range(5):
             message = other.types[ODOMETRY](x=float(k))
             writer.write(topic, k, other.serialize_cdr(message, ODOMETRY))
-    with pytest.raises(FileError, match='0 keyframes from /odom; expected 2 or more; '
+    with pytest.raises(l1.L1SlamError, match='0 keyframes from /odom; expected 2 or more; '
                                         '5 messages refused: a message on /odom; expected the '
                                         'fields of nav_msgs/msg/Odometry$'):
-        read_input(tmp_path / 'a')
+        l1.read_graph(tmp_path / 'a')
 
 
-def test_loops_may_be_recorded_before_the_odometry_they_name(tmp_path, world):
+def test_loops_may_be_recorded_before_the_odometry_they_name(tmp_path, graph_of, world):
     loops = [m for m in world[1] if m[0] == '/loop_closures']
     start = world[1][0][2]
     early = [(*m[:2], start - len(loops) + k, m[3]) for k, m in enumerate(loops)]
     odometry = [m for m in world[1] if m[0] == '/odom']
-    record = read_input(mcap_file(tmp_path / 'a.mcap', early + odometry), EVERY)
+    record = graph_of(mcap_file(tmp_path / 'a.mcap', early + odometry), every=True)
     assert record.skipped == ()
-    assert len(record.graph.between) == len(world[2].graph.between)
+    assert len(record.graph.between) == len(read(world[0]).graph.between)
 
 
-def test_duplicates_and_a_clock_set_back_are_counted_and_told(tmp_path, world):
+def test_duplicates_and_a_clock_set_back_are_counted_and_told(tmp_path, graph_of, world):
     recording = world[1]
     odometry = [m for m in recording if m[0] == '/odom']
     # The robot's driver starts anew: the messages of before come once more, later.
     again = [(*m[:2], m[2] + 1000 * SECOND, m[3]) for m in odometry[:30]]
     twice = sorted(recording + odometry[:10], key=lambda m: m[2])
     path = mcap_file(tmp_path / 'a.mcap', twice + again)
-    record = read_input(path, EVERY)
+    record = graph_of(path, every=True)
     first, last = odometry[0][2], odometry[-1][2]
     assert record.skipped == (
         f'10 messages refused: odometry stamp {first} ns is not after the last one, {first} ns',
         f'odometry stamp {first} ns is not after the last one, {last} ns; a new part of the map '
         'begins where the last one ends')
-    assert len(record.graph.between) == len(world[2].graph.between) + len(again) - 1
+    assert len(record.graph.between) == len(read(world[0]).graph.between) + len(again) - 1
 
 
 def changed(message, change):
@@ -154,7 +159,7 @@ def changed(message, change):
     return topic, msgtype, time, bytes(TYPES.serialize_cdr(decoded, msgtype))
 
 
-def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, world):
+def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, graph_of, world):
     recording = list(world[1])
 
     def broken(k, change):
@@ -166,7 +171,7 @@ def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, world):
     broken(odometry[60], lambda m: setattr(m.header.stamp, 'sec', 0))
     broken(loops[3], lambda m: setattr(m.header, 'frame_id', 'map'))
     broken(loops[4], lambda m: setattr(m.header.stamp, 'sec', 2_000_000))
-    record = read_input(mcap_file(tmp_path / 'a.mcap', recording), EVERY)
+    record = graph_of(mcap_file(tmp_path / 'a.mcap', recording), every=True)
     for said, start in zip(sorted(record.skipped), [
             '1 loop not used: the odometry ends before its times',
             "1 message refused: frame 'map' of a loop; expected base_link@",
@@ -177,15 +182,18 @@ def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, world):
     assert record.graph.n_poses == 118
 
 
-def test_messages_come_in_order_of_time_even_from_a_file_without_order(tmp_path, world, rng):
+def test_messages_come_in_order_of_time_even_from_a_file_without_order(
+        tmp_path, graph_of, world, rng):
     shuffled = [world[1][k] for k in rng.permutation(len(world[1]))]
     for options in ({'use_chunking': False}, {'chunk_size': 5_000}):
         path = mcap_file(tmp_path / 'a.mcap', shuffled, **options)
-        times = [m.time for m in read_messages(path)]
-        assert times == [m[2] for m in world[1]]
+        found = graph_of(path, every=True)
+        # Of one time, in any order.
+        assert found.skipped == () and [sorted(one.splitlines()) for one in found.content] == [
+            sorted(one.splitlines()) for one in world[2]]
 
 
-def test_faults_of_the_odometry_are_told(tmp_path, world):
+def test_faults_of_the_odometry_are_told(tmp_path, graph_of, world):
     """A jump, a stamp ahead, a restart, a variance of 1e12, and a last message on its own."""
     def moved(x, sec, k, index=-1, variance=0.0):
         def change(m):
@@ -199,7 +207,7 @@ def test_faults_of_the_odometry_are_told(tmp_path, world):
     moved(0.0, 5000, 40)
     moved(0.0, 0, 50, 7, 1e12)
     moved(0.0, 5000, len(recording) - 1)
-    record = read_input(mcap_file(tmp_path / 'a.mcap', recording), EVERY)
+    record = graph_of(mcap_file(tmp_path / 'a.mcap', recording), every=True)
     assert record.graph.n_poses == len(recording) - 3
     jump, ahead, variance, last = record.skipped
     assert jump.startswith('1 message refused: odometry 3e+08 m from one message to the next')

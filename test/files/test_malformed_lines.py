@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import pytest
 
-from l1slam_ros.core.errors import FileError
-from l1slam_ros.io.graphs.graph_file import read_graph_file
+import l1slam_ros as l1
 
 UNIT = ' '.join('1' if row == column else '0' for row in range(6) for column in range(row, 6))
 
@@ -71,8 +70,8 @@ def test_each_malformed_line_is_named(tmp_path, name, line, message):
 
     # A good line follows: it is not the last one that is named, nor the first of its tag.
     path.write_text(written('\n'.join([*SOUND, line, 'E 9 3 POSE INFO\n'])))
-    with pytest.raises(FileError) as caught:
-        read_graph_file(path)
+    with pytest.raises(l1.L1SlamError) as caught:
+        l1.read_graph(path)
     said = written(message).format(few=2 + pose, many=3 + edge, edge=edge, vertex=pose,
                                    beside=2 if 'space' in name else 3)
     assert str(caught.value).startswith(f'{path}:6: {said}') and '\n' not in str(caught.value)

@@ -16,40 +16,36 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+from command import run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
+from records import error_of, read
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from worlds import simulated_bag
 
+import l1slam_ros as l1
 from bags import (
-    KINDS,
     NOTE,
+    NOTED,
     mcap_file,
     recording_of,
     ros1_file,
     rosbag2_directory,
     split_directory,
     write_mcap,
-    write_world,
 )
 from l1slam_ros.cli.main import main
-from l1slam_ros.core.errors import FileError, L1SlamError
-from l1slam_ros.io.bags.bag_files import storage_files
-from l1slam_ros.io.bags.damaged.salvage import Salvage
-from l1slam_ros.io.bags.from_graph import GRAPH_NOTE
-from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note, read_raw
-from l1slam_ros.io.formats import read_input
-from l1slam_ros.io.graphs.graph_file import read_graph_file
+
+SIZE = 200
 
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     """Return a bag of this package: 200 odometry messages, 101 loops."""
-    path = tmp_path_factory.mktemp('world') / 'bag'
-    write_world(path, 200, 300)
-    return path
+    return simulated_bag(tmp_path_factory.mktemp('world') / 'bag', SIZE, 300)
 
 
 @pytest.fixture(scope='module')
@@ -57,13 +53,53 @@ def recording(bag):
     return recording_of(bag)
 
 
-def read(path, topics=None):
-    """Return what can be read as a recording, and what is said of damage."""
-    said = []
-    messages = [tuple(m) for m in read_raw(path, topics, said.append)]
-    messages = [(topic, msgtype, moment, data) for topic, msgtype, moment, data in messages]
+def factors_of(graph):
+    """Return the factors of odometry and of loops, each its keyframes and what is measured."""
+    rows = graph.between.is_odometry
+    both = np.hstack((graph.between.pairs, graph.between.measurement))
+    return both[rows].tolist(), both[~rows].tolist()
+
+
+@pytest.fixture(scope='module')
+def whole(bag):
+    """Return the factors of the whole bag."""
+    return factors_of(l1.read_graph(bag)[0])
+
+
+def damage_in(sentences):
+    """Return what is said of damage."""
+    said = [sentence for sentence in sentences if ' damaged' in sentence]
     assert len(said) <= 1 and not any('\n' in sentence for sentence in said)
-    return messages, ''.join(said)
+    return ''.join(said)
+
+
+@pytest.fixture
+def read_part(recording, whole):
+    """
+    Return a function from a bag to how many messages of it are used, and what is said of damage.
+
+    These must be the first ones of the recording, but for so many of the last.
+    """
+    def used(path, but=0, recording=recording, whole=whole):
+        record = read(path)
+        said, count = damage_in(record.skipped), len(recording)
+        if said:
+            count = int(re.search('; ([0-9,]+) messages ', said)[1].replace(',', ''))
+        poses = sum(message[0] == '/odom' for message in recording[:count - but])
+        steps, loops = factors_of(record.graph)
+        for found, first, n in ((steps, whole[0], poses - 1),
+                                (loops, whole[1], count - but - poses)):
+            assert found[:n] == first[:n] and 0 <= len(found) - n <= but
+        return count, said
+    return used
+
+
+def same(path, messages):
+    """Check that a bag makes the graph of other messages; return what is said of damage."""
+    found = read(path)
+    expected = read(mcap_file(path.with_name('expected.mcap'), messages, note=NOTED))
+    assert factors_of(found.graph) == factors_of(expected.graph)
+    return damage_in(found.skipped)
 
 
 def assert_told(said, path, used):
@@ -71,28 +107,16 @@ def assert_told(said, path, used):
                         rf'{used:,} messages before that were used', said), said
 
 
-@pytest.mark.parametrize('kind', [kind for kind in KINDS if not kind.startswith('ROS 1')])
-def test_what_is_whole_is_walked_to_its_end(tmp_path, recording, kind):
-    path = KINDS[kind](tmp_path, recording)
-    found = []
-    for file in storage_files(path) if path.is_dir() else [path]:
-        salvage = Salvage(file)
-        found += salvage.messages(None, None, None)
-        assert salvage.damage is None
-    assert [m[:3] for m in found] == [m[:3] for m in recording]
-    assert [m.data for m in found] == [m[3] for m in recording]
-
-
 # What the file holds up to a byte, by independent means: kind -> the file's bytes, and where it
 # ends after each message of the recording, in the order of writing.
 def unchunked(folder, recording):
     stream, ends = BytesIO(), []
-    write_mcap(stream, recording, ends, use_chunking=False)
+    write_mcap(stream, recording, ends, note=NOTED, use_chunking=False)
     return 'a.mcap', stream.getvalue(), ends
 
 
 def uncompressed(folder, recording):
-    whole = mcap_file(folder / 'a.mcap', recording, compression=CompressionType.NONE,
+    whole = mcap_file(folder / 'a.mcap', recording, note=NOTED, compression=CompressionType.NONE,
                       chunk_size=100_000).read_bytes()
     ends, at = [], 0
     for *_, data in recording:
@@ -109,7 +133,9 @@ def database(folder, recording):
 
 
 @pytest.mark.parametrize('kind', [unchunked, uncompressed, database])
-def test_every_message_before_a_cut_is_used_and_no_other(tmp_path, recording, kind, rng):
+def test_every_message_before_a_cut_is_used_and_no_other(
+        tmp_path, read_part, recording, kind, rng):
+    recording = recording[:100]
     name, whole, ends = kind(tmp_path, recording)
     assert len(ends) == len(recording) and sorted(ends) == ends
     path = tmp_path / f'cut_{name}'
@@ -117,56 +143,57 @@ def test_every_message_before_a_cut_is_used_and_no_other(tmp_path, recording, ki
         path.write_bytes(whole[:cut])
         expected = int(np.searchsorted(ends, cut, 'right'))
         try:
-            found, said = read(path)
-        except FileError as error:
-            assert expected == 0 and '\n' not in str(error)
+            found, said = read_part(path)
+        except l1.L1SlamError as error:  # of one keyframe there is no graph
+            assert expected < 3 and '\n' not in str(error)
             continue
-        assert len(found) == expected
-        assert [m[:3] for m in found] == [m[:3] for m in recording[:expected]]
+        assert found == expected
         assert_told(said, path, expected)
         assert f': it breaks off after {cut:,} bytes; ' in said
 
 
-def test_damage_is_an_error_to_who_wants_no_part(tmp_path, bag):
+def test_damage_is_a_warning_in_python(tmp_path, bag):
     path = tmp_path / 'a.mcap'
-    path.write_bytes((bag / 'bag.mcap').read_bytes()[:5000])
-    for call in (read_messages, read_raw):
-        with pytest.raises(L1SlamError, match='a.mcap is damaged: it breaks off after 5,000 b'):
-            list(call(path))
+    path.write_bytes((bag / 'bag.mcap').read_bytes()[:8000])
+    with pytest.warns(UserWarning, match='a.mcap is damaged: it breaks off after 8,000 b'):
+        l1.read_graph(path)
 
 
 @pytest.mark.parametrize('compression', ['NONE', 'ZSTD', 'LZ4'])
-def test_of_a_chunk_cut_in_two_the_first_part_is_used(tmp_path, recording, compression):
+def test_of_a_chunk_cut_in_two_the_first_part_is_used(tmp_path, read_part, recording, compression):
     # One chunk for all: a decoder works block by block.
-    path = mcap_file(tmp_path / 'a.mcap', recording, compression=CompressionType[compression],
-                     chunk_size=2**30)
+    path = mcap_file(tmp_path / 'a.mcap', recording, note=NOTED,
+                     compression=CompressionType[compression], chunk_size=2**30)
     whole = path.read_bytes()
     chunk, = make_reader(BytesIO(whole)).get_summary().chunk_indexes
     path.write_bytes(whole[:chunk.chunk_start_offset + int(0.9 * chunk.chunk_length)])
-    found, said = read(path)
-    assert found == recording[:len(found)]
-    assert len(recording) // 3 < len(found) < len(recording)
-    assert_told(said, path, len(found))
+    found, said = read_part(path)
+    assert len(recording) // 3 < found < len(recording)
+    assert_told(said, path, found)
 
 
-def test_from_the_middle_of_a_bag_on_nothing_comes_twice(tmp_path, recording):
+def test_from_the_middle_of_a_bag_on_nothing_comes_twice(tmp_path, read_part, recording):
     """The library reads up to a bad chunk; what was read then is not read again."""
     recording = coarse(recording)
-    path = mcap_file(tmp_path / 'a.mcap', recording, chunk_size=20_000)
+    path = mcap_file(tmp_path / 'a.mcap', recording, note=NOTED, chunk_size=20_000)
     whole = bytearray(path.read_bytes())
     chunks = make_reader(BytesIO(whole)).get_summary().chunk_indexes
     bad = chunks[len(chunks) // 2]
     whole[bad.chunk_start_offset + bad.chunk_length // 2] ^= 1
     path.write_bytes(whole)
-    found, said = read(path)
-    assert found == recording[:len(found)]
-    assert len(recording) // 3 < len(found) < len(recording)
-    assert_told(said, path, len(found))
-    only, _ = read(path, ['/loop_closures'])
-    assert only == [m for m in found if m[0] == '/loop_closures']
+    found, said = read_part(path)
+    assert len(recording) // 3 < found < len(recording)
+    assert_told(said, path, found)
+    # Of one topic alone the same: what is on the other is not decoded.
+    loops = sum(m[0] != '/odom' for m in recording[:found])
+    with pytest.warns(UserWarning, match='expected --loop-topic'):
+        graph, _ = l1.read_graph(path, loop_topic='/odom')
+    assert graph.n_poses == len(graph.between) + 1 == found - loops
 
 
-def test_wherever_a_bit_of_our_bag_is_wrong_no_message_is(tmp_path, bag, recording, rng):
+def test_wherever_a_bit_of_our_bag_is_wrong_no_message_is(tmp_path, read_part, rng):
+    bag = simulated_bag(tmp_path / 'bag', 140, 210)
+    recording, of_bag = recording_of(bag), factors_of(l1.read_graph(bag)[0])
     whole = (bag / 'bag.mcap').read_bytes()
     path = tmp_path / 'a.mcap'
     told = 0
@@ -174,77 +201,76 @@ def test_wherever_a_bit_of_our_bag_is_wrong_no_message_is(tmp_path, bag, recordi
         damaged = bytearray(whole)
         damaged[at] ^= 1 << rng.integers(8)
         path.write_bytes(damaged)
-        with suppress(FileError):
-            found, said = read(path)
-            assert found == recording[:len(found)]
-            assert said or len(found) == len(recording)
+        with suppress(l1.L1SlamError):
+            found, said = read_part(path, recording=recording, whole=of_bag)
+            assert said or found == len(recording)
             told += bool(said)
     assert told > 15
 
 
-def test_a_record_that_swallows_the_rest_of_a_chunk_is_damage(tmp_path, recording):
-    path = mcap_file(tmp_path / 'a.mcap', recording, compression=CompressionType.NONE,
+def test_a_record_that_swallows_the_rest_of_a_chunk_is_damage(tmp_path, read_part, recording):
+    path = mcap_file(tmp_path / 'a.mcap', recording, note=NOTED, compression=CompressionType.NONE,
                      enable_crcs=False)
     whole, k = bytearray(path.read_bytes()), len(recording) // 2
     head = whole.index(recording[k][3]) - 22 - 9  # of the message and of its record
     whole[head:head + 9] = struct.pack('<BQ', 200, 2**40)
     path.write_bytes(whole)
-    found, said = read(path)
-    assert found == recording[:k]
+    found, said = read_part(path)
+    assert found == k
     assert re.search(rf' is damaged after .*; {k:,} messages before that were used', said)
 
 
-def test_zeros_at_the_end_are_damage(tmp_path, recording):
+def test_zeros_at_the_end_are_damage(tmp_path, read_part, recording):
     for options in ({'use_chunking': False}, {'compression': CompressionType.NONE}):
-        path = mcap_file(tmp_path / 'a.mcap', recording, **options)
+        path = mcap_file(tmp_path / 'a.mcap', recording, note=NOTED, **options)
         whole = path.read_bytes()
         path.write_bytes(whole[:len(whole) // 2] + bytes(len(whole) // 2))
-        found, said = read(path)
         # The last one may have zeros in it: nothing in such a file tells.
-        assert found[:-1] == recording[:len(found) - 1]
-        assert abs(len(found) - len(recording) // 2) < 20
+        found, said = read_part(path, but=1)
+        assert abs(found - len(recording) // 2) < 20
         assert re.search(r' is damaged after [0-9,]+ of [0-9,]+ bytes; ', said)
 
 
-def test_a_directory_without_its_metadata(tmp_path, bag, recording):
+def test_a_directory_without_its_metadata(tmp_path, capsys, read_part, bag, recording):
     folder = shutil.copytree(bag, tmp_path / 'a')
     for content in (None, '', 'x', '[', 'rosbag2_bagfile_information:\n  version: 9\n', '\x00'):
         (folder / 'metadata.yaml').unlink(missing_ok=True)
         if content is not None:
             (folder / 'metadata.yaml').write_text(content)
         wrong = 'is missing' if content is None else 'cannot be read'
-        found, said = read(folder)
-        assert found == recording
+        found, said = read_part(folder)
+        assert found == len(recording)
         assert said == (f'{folder} is damaged: its metadata.yaml {wrong}; '
                         '301 messages of its files were used')
-        assert read_note(folder) == GRAPH_NOTE
-        assert [t.count for t in bag_summary(folder).topics] == [101, 200]
+    listed = run(capsys, 'info', folder, code=3)[0].splitlines()
+    assert listed[1] == 'note        covariance increment, keyframes every'
+    assert [line.split(' of ')[0] for line in listed[2:4]] == [
+        'topic       /loop_closures: 101', 'topic       /odom: 200']
 
 
 @pytest.mark.parametrize('mode', [CompressionMode.NONE, CompressionMode.FILE])
 @pytest.mark.parametrize('plugin', StoragePlugin)
-def test_a_split_bag_is_used_up_to_the_damage(tmp_path, recording, plugin, mode):
+def test_a_split_bag_is_used_up_to_the_damage(tmp_path, read_part, recording, plugin, mode):
     folder = split_directory(tmp_path / 'a', recording, plugin, mode, parts=12)
     files = sorted(folder.glob('a_*'), key=lambda file: int(re.findall('[0-9]+', file.name)[0]))
     size = -(-len(recording) // 12)
     files[11].write_bytes(files[11].read_bytes()[:-4000])
-    found, said = read(folder)
-    assert found == recording[:len(found)] and len(found) >= 11 * size
+    found, said = read_part(folder)
+    assert found >= 11 * size
     assert said.startswith(f'{files[11]} is damaged: ')
     (folder / 'metadata.yaml').unlink()
-    assert read(folder) == (found, said)
+    assert read_part(folder) == (found, said)
     files[10].unlink()
-    assert read(folder)[0] == recording[:10 * size] + found[11 * size:]
+    assert same(folder, recording[:10 * size] + recording[11 * size:found])
 
 
 def test_a_missing_file_of_a_split_bag(tmp_path, recording):
     folder = split_directory(tmp_path / 'a', recording, StoragePlugin.MCAP)
     size = -(-len(recording) // 3)
     (folder / 'a_1.mcap').unlink()
-    found, said = read(folder)
-    assert found == recording[:size] + recording[2 * size:]
-    assert said == (f'{folder / "a_1.mcap"} is damaged: the file is missing; '
-                    f'{len(found)} messages before and after that were used')
+    left = recording[:size] + recording[2 * size:]
+    assert same(folder, left) == (f'{folder / "a_1.mcap"} is damaged: the file is missing; '
+                                  f'{len(left)} messages before and after that were used')
 
 
 def coarse(recording):
@@ -253,7 +279,7 @@ def coarse(recording):
             for topic, msgtype, moment, data in recording]
 
 
-def test_a_database_with_a_damaged_page(tmp_path, recording):
+def test_a_database_with_a_damaged_page(tmp_path, read_part, recording):
     """The library reads up to it; what was read then is not read again."""
     recording = coarse(recording)
     path = rosbag2_directory(tmp_path / 'a', recording, StoragePlugin.SQLITE3) / 'a.db3'
@@ -261,34 +287,29 @@ def test_a_database_with_a_damaged_page(tmp_path, recording):
     at = whole.index(recording[250][3]) // 4096 * 4096
     whole[at:at + 200] = b'\xff' * 200
     path.write_bytes(whole)
-    found, said = read(path)
-    assert found == recording[:len(found)] and 240 < len(found) <= 250
+    found, said = read_part(path)
+    assert 240 < found <= 250
     assert said == (f'{path} is damaged: database disk image is malformed; '
-                    f'{len(found)} messages before that were used')
+                    f'{found} messages before that were used')
 
 
 def test_a_message_that_cannot_be_decoded_is_left_out(tmp_path, recording):
     broken = list(recording)
     for k in (20, 30):
         broken[k] = (*broken[k][:3], broken[k][3][:40])
-    path = mcap_file(tmp_path / 'a.mcap', broken)
-    said = []
-    times = [m.time for m in read_messages(path, None, said.append)]
-    assert times == [m[2] for k, m in enumerate(recording) if k not in (20, 30)]
-    assert said == [f'{path} is damaged: 2 messages cannot be decoded; 299 others were used']
-    with pytest.raises(L1SlamError, match='2 messages cannot be decoded; 299 others were used'):
-        list(read_messages(path))
-    assert read_input(path).damage == said[0]
+    path = mcap_file(tmp_path / 'a.mcap', broken, note=NOTED)
+    sound = [m for k, m in enumerate(recording) if k not in (20, 30)]
+    assert same(path, sound) == (
+        f'{path} is damaged: 2 messages cannot be decoded; 299 others were used')
 
 
-def test_a_ros1_bag_that_is_damaged_is_refused(tmp_path, recording):
+def test_a_ros1_bag_that_is_damaged_is_refused(tmp_path, capsys, recording):
     path = ros1_file(tmp_path / 'a.bag', recording)
     whole = path.read_bytes()
     for damaged in whole[:len(whole) // 2], b'x', whole[:-200] + bytes(200):
         path.write_bytes(damaged)
-        for call in (lambda: read(path)), (lambda: bag_summary(path)):
-            with pytest.raises(FileError, match=r'a\.bag: damaged, or not a bag .*rosbag reindex'):
-                call()
+        for said in error_of(l1.read_graph, path), run(capsys, 'info', path, code=2)[1]:
+            assert re.search(r'a\.bag: damaged, or not a bag .*rosbag reindex', said)
 
 
 # What happens to files: bytes are changed, lost or inserted, and the end is lost or zero.
@@ -319,7 +340,7 @@ def damaged(whole, pieces):
 def small(tmp_path_factory):
     """Return a folder with one small recording as several kinds."""
     folder = tmp_path_factory.mktemp('small')
-    write_world(folder / 'bag', 40, 60)
+    simulated_bag(folder / 'bag', 40, 60)
     messages = recording_of(folder / 'bag')
     shutil.copy(folder / 'bag' / 'bag.mcap', folder / 'ours.mcap')
     mcap_file(folder / 'lz4.mcap', messages, compression=CompressionType.LZ4, chunk_size=5_000)
@@ -356,5 +377,5 @@ def test_no_bytes_make_a_traceback_or_half_a_file(tmp_path, small, capfd, name, 
     assert sorted(p.name for p in tmp_path.iterdir() if p != folder) == (
         [] if code == 2 else ['out.g2o', 'out.g2o.stamps.txt'])
     if code != 2:
-        assert read_graph_file(output).graph.n_poses >= 2
+        assert l1.read_graph(output)[0].n_poses >= 2
         assert (code == 3) == ('is damaged' in err)

@@ -1,0 +1,135 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""Pose graphs of other front ends, in their own messages: from bags, and by the node's reader."""
+
+import numpy as np
+import pytest
+from command import run
+from pose_graphs import (
+    COVARIANCE,
+    GLOBAL,
+    LANDMARK,
+    LOOPCLOSE,
+    MAP_GRAPH,
+    ODOM,
+    PRIOR,
+    SECOND,
+    SIGMA,
+    VIRTUAL,
+    between,
+    driven,
+    edge,
+    growing,
+    link,
+    pose_graph,
+    write,
+)
+from records import information_of, read
+
+import l1slam_ros as l1
+
+
+@pytest.fixture
+def truth(rng):
+    return rng.normal(size=(6, 3))
+
+
+@pytest.mark.parametrize('ends', [(1, 6), (6, 1)])
+def test_a_link_is_a_loop_between_the_times_of_its_keyframes(tmp_path, truth, ends):
+    """Whichever way it points: the later keyframe seen from the earlier, its noise in its axes."""
+    graphs = growing(truth, [link(*ends, GLOBAL, truth)])
+    graphs.append(graphs[-1])  # it is repeated in every message from then on
+    record = read(write(tmp_path / 'bag', [
+        *driven(truth), *(('/graph', 10 + k, graph) for k, graph in enumerate(graphs))]),
+        loop_topic='/graph')
+    assert record.skipped == ()
+    assert record.stamps.tolist() == [(10 + k) * SECOND for k in range(6)]
+    factors = record.graph.between
+    (row,) = np.flatnonzero(~factors.is_odometry)
+    assert factors.pairs[row].tolist() == [0, 5] and not factors.trusted[row]
+    expected = between(truth[:1], truth[5:])
+    assert np.allclose(factors.measurement[row], expected)
+    turned = COVARIANCE[np.ix_((0, 1, 5), (0, 1, 5))]
+    if ends == (6, 1):  # by the adjoint of the inverse
+        ((x, y, heading),) = between(expected, np.zeros((1, 3)))
+        c, s = np.cos(heading), np.sin(heading)
+        Ad = np.array([[c, -s, y], [s, c, -x], [0, 0, 1]])
+        turned = Ad @ turned @ Ad.T
+    assert np.allclose(np.linalg.inv(information_of(record.graph)[row]), turned)
+
+
+def test_only_what_was_measured_between_two_keyframes_is_a_loop(tmp_path, truth):
+    closing = [link(6, 1, VIRTUAL, truth), link(6, 6, PRIOR, truth), link(6, 2, LANDMARK, truth)]
+    record = read(write(tmp_path / 'bag', [*driven(truth), *(
+        ('/graph', 10 + k, graph) for k, graph in enumerate(growing(truth, closing)))]),
+        loop_topic='/graph')
+    assert record.graph.between.is_odometry.all() and record.skipped == ()
+
+
+def test_who_listens_late_knows_the_time_of_the_newest_alone(tmp_path, truth):
+    last = growing(truth, [link(6, 1, GLOBAL, truth)])[-1]
+    record = read(write(tmp_path / 'bag', [*driven(truth), ('/graph', 15, last)]),
+                  loop_topic='/graph')
+    assert record.graph.between.is_odometry.all()
+    assert record.skipped[0].startswith('1 message refused: a loop of keyframe 1, whose stamp no')
+
+
+@pytest.fixture
+def bag(tmp_path, truth):
+    """A bag with odometry, and the graphs of RTAB-Map and of pose_graph_tools."""
+    graphs = growing(truth, [link(6, 1, GLOBAL, truth)])
+    return write(tmp_path / 'bag', [
+        *driven(truth), *(('/rtabmap/mapGraph', 10 + k, graph) for k, graph in enumerate(graphs)),
+        ('/kimera/pose_graph', 20, pose_graph(
+            20, [(k, 9.0 + k) for k in range(1, 7)],
+            [edge(k, k + 1, ODOM, truth) for k in range(1, 6)] + [edge(1, 6, LOOPCLOSE, truth)]))])
+
+
+@pytest.mark.parametrize('topic', ['/rtabmap/mapGraph', '/kimera/pose_graph'])
+def test_from_a_bag_come_the_loops_or_the_whole_graph(bag, truth, topic):
+    """The definitions are those in the bag: no package is installed that knows them."""
+    graph = read(bag, loop_topic=topic).graph
+    loops = graph.between.pairs[~graph.between.is_odometry]
+    assert loops.tolist() == [[0, graph.n_poses - 1]]
+    whole = read(bag, odom_topic=topic)
+    factors = whole.graph.between
+    assert whole.ids.tolist() == [1, 2, 3, 4, 5, 6] and not whole.skipped
+    assert factors.is_odometry.tolist() == [True] * 5 + [False]
+    assert np.allclose(whole.graph.manifold.residual(
+        factors.measurement, truth[factors.i], truth[factors.j]), 0)
+    sigma = 1 / np.diagonal(factors.sqrt_information, axis1=1, axis2=2)
+    assert np.allclose(sigma, SIGMA[[0, 1, 5]])
+
+
+@pytest.mark.parametrize('keys', [(6, 2**63), (2**64 - 1, 2**63)])
+def test_a_key_beyond_63_bits_is_one_line(capsys, tmp_path, truth, keys):
+    truth = {k - 1: pose for k, pose in enumerate(truth, 1)} | {
+        key - 1: truth[0] for key in keys[-1:] + keys[:1] if key > 6}
+    message = pose_graph(20, [(k, 9.0) for k in (*range(1, 7), *keys)], [
+        *(edge(k, k + 1, ODOM, truth) for k in range(1, 6)), edge(*keys, LOOPCLOSE, truth)])
+    write(tmp_path / 'bag', [('/pose_graph', 1, message)])
+    out, _ = run(capsys, 'info', tmp_path / 'bag', '--odom-topic', '/pose_graph', code=3)
+    assert 'poses       6 in SE2, ids 1 to 6' in out
+    assert f'an edge of keyframe {max(keys)}; expected numbers up to 2^63 - 1' in out
+
+
+def test_who_read_no_loops_is_told_of_the_graphs(bag):
+    assert read(bag).skipped == (
+        'no loop is in the map, but there are loops in 1 message on /kimera/pose_graph and 6 '
+        'messages on /rtabmap/mapGraph; expected --loop-topic /kimera/pose_graph or --loop-topic '
+        '/rtabmap/mapGraph',)
+    for topics in ({'loop_topic': '/rtabmap/mapGraph'}, {'odom_topic': '/rtabmap/mapGraph'},
+                   {'odom_topic': '/kimera/pose_graph'}):
+        assert read(bag, **topics).skipped == ()
+
+
+def test_who_has_no_odometry_is_told_of_the_graph(bag):
+    said = f'0 keyframes from /none; .*{MAP_GRAPH} is on /rtabmap'
+    with pytest.raises(l1.L1SlamError, match=said):
+        l1.read_graph(bag, odom_topic='/none')
