@@ -233,3 +233,28 @@ def test_modules_that_run_are_short(module):
 def test_no_attribute_is_set_from_outside_its_class(module):
     """A clone is of the class that makes it."""
     assert {of for of, _ in stored(tree(module))} <= {'self', 'clone'}
+
+
+# Folders whose tests enter by the doors, and the modules in them that do not yet.
+BY_DOORS = 'cli', 'files', 'fleet', 'node', 'python'
+BY_INNER_DOORS = {'test_progress.py', 'test_batch_command.py'}
+
+
+@pytest.mark.parametrize('folder', BY_DOORS)
+def test_tests_enter_by_the_doors(folder):
+    """The package, the command and the executables: then what is inside can move."""
+    for path in (Path(__file__).parent / folder).rglob('*.py'):
+        inner = {name for name in imported(ast.parse(path.read_text()))
+                 if name.startswith(f'{PACKAGE}.') and name != f'{PACKAGE}.cli.main'}
+        assert bool(inner) == (path.name in BY_INNER_DOORS), f'{path}: {inner}'
+
+
+def imported(module):
+    """Return the names of the modules that a module imports, wherever it does."""
+    names = set()
+    for node in ast.walk(module):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(node.module)
+    return names
