@@ -9,7 +9,9 @@
 """Damaged inputs that benchmarks/mutated_inputs.py once found to end in disorder."""
 
 import gzip
+import tracemalloc
 
+import numpy as np
 import pytest
 from command import run, solve_json
 
@@ -68,3 +70,20 @@ def test_any_information_that_is_read_can_be_given(capsys, tmp_path, information
         f'EDGE_SE2 {i} {j} {int(j - i == 1)} 0 {1.5708 if j - i == 1 and i % 5 == 4 else 0}\n'
         for i, j in ends))
     assert solve_json(capsys, path, '--information', information, code=None)['poses'] == 40
+
+
+def test_a_drive_that_goes_on_far_off_takes_no_memory_for_what_is_between(capsys, tmp_path):
+    lines = []
+    along = np.deg2rad(np.arange(24) * 7.5 - 86.25)
+    ranges = ' '.join(map(str, 2 / np.maximum(np.cos(along), abs(np.sin(along)))))
+    for k in range(12):  # too few points to tell where the robot is
+        pose = f'{k * 0.6 + 50_000 * (k > 5)} {500 * (k > 5)} 0'
+        lines.append(f'FLASER 24 {ranges} {pose} {pose} {k + 10**6 * (k > 5)} host 0\n')
+    path = tmp_path / 'log.clf'
+    path.write_text(''.join(lines))
+    tracemalloc.start()
+    try:
+        run(capsys, 'info', path)
+        assert tracemalloc.get_traced_memory()[1] < 2**27
+    finally:
+        tracemalloc.stop()

@@ -15,6 +15,7 @@ how far was seen in each direction.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -104,6 +105,11 @@ class Points:
         """The points that have a normal, and these normals, (k, 2) each."""
         has = have_normal(self.normals)
         return self.xy[has], self.normals[has]
+
+    @cached_property
+    def reach(self) -> float:
+        """How far from the robot the farthest of them is [m]."""
+        return float(np.hypot(*self.xy.T).max(initial=0.0))
 
 
 def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008

@@ -91,10 +91,12 @@ class Submap:
 
 def submap_of(keyframes: Sequence[Keyframe], at: int, before: int = AROUND, after: int = AROUND
               ) -> Submap:
-    """Return the map of the keyframes around one, of its own part only."""
+    """Return the map of the keyframes around one that may see the same, of its own part only."""
     own = keyframes[at]
+    # After a pause the wheels may say that the robot is far from all it saw before.
     near = [keyframe for keyframe in keyframes[max(at - before, 0) : at + after + 1]
-            if keyframe.part == own.part]
+            if keyframe.part == own.part and np.hypot(*(keyframe.pose - own.pose)[:2]) <= (
+                keyframe.points.reach + own.points.reach)]
     poses = se2.between(np.tile(own.pose, (len(near), 1)), np.array([k.pose for k in near]))
     seen = np.concatenate([keyframe.points.xy for keyframe in near])
     normal = np.concatenate([keyframe.points.normals for keyframe in near])
