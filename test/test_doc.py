@@ -57,7 +57,6 @@ NOT_RUN = {
     'python benchmarks/false_loops.py': PEERS,
     'python benchmarks/gps.py': MINUTES,
     'python benchmarks/norms.py': MINUTES,
-    'python benchmarks/mutated_inputs.py': MINUTES,
     'python benchmarks/solvers ': PEERS,
     'python benchmarks/incremental.py': PEERS,
     'python benchmarks/cli/startup.py': MINUTES,
