@@ -72,18 +72,35 @@ def test_any_information_that_is_read_can_be_given(capsys, tmp_path, information
     assert solve_json(capsys, path, '--information', information, code=None)['poses'] == 40
 
 
-def test_a_drive_that_goes_on_far_off_takes_no_memory_for_what_is_between(capsys, tmp_path):
-    lines = []
+def drive_that_goes_on_far_off(path, metres):
+    """Write a log of scans with too few points to tell where the robot is."""
     along = np.deg2rad(np.arange(24) * 7.5 - 86.25)
     ranges = ' '.join(map(str, 2 / np.maximum(np.cos(along), abs(np.sin(along)))))
-    for k in range(12):  # too few points to tell where the robot is
-        pose = f'{k * 0.6 + 50_000 * (k > 5)} {500 * (k > 5)} 0'
-        lines.append(f'FLASER 24 {ranges} {pose} {pose} {k + 10**6 * (k > 5)} host 0\n')
-    path = tmp_path / 'log.clf'
-    path.write_text(''.join(lines))
+    poses = [f'{k * 0.6 + metres * (k > 5)} {0.01 * metres * (k > 5)} 0' for k in range(12)]
+    path.write_text(''.join(
+        f'FLASER 24 {ranges} {pose} {pose} {k + 10**6 * (k > 5)} host 0\n'
+        for k, pose in enumerate(poses)))
+    return path
+
+
+def most_memory(work):
+    """Return the most memory that some work takes [bytes]."""
     tracemalloc.start()
     try:
-        run(capsys, 'info', path)
-        assert tracemalloc.get_traced_memory()[1] < 2**27
+        work()
+        return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
+
+
+def test_a_drive_that_goes_on_far_off_takes_no_memory_for_what_is_between(capsys, tmp_path):
+    path = drive_that_goes_on_far_off(tmp_path / 'log.clf', 50_000)
+    assert most_memory(lambda: run(capsys, 'info', path)) < 2**27
+
+
+def test_a_grid_takes_a_few_bytes_a_cell(capsys, tmp_path):
+    path, grid = drive_that_goes_on_far_off(tmp_path / 'log.clf', 6000), tmp_path / 'map.pgm'
+    memory = most_memory(lambda: run(
+        capsys, 'solve', path, '--quiet', '--grid', grid, code=None))
+    assert grid.stat().st_size > 2**26
+    assert memory < 9 * grid.stat().st_size

@@ -53,11 +53,14 @@ def write_grid(path: Path, grid: Grid) -> None:
 
     """
     occupancy = grid.occupancy
-    shade = np.where(occupancy < 0, _UNKNOWN, np.where(occupancy > 0, _OCCUPIED, _FREE))
-    picture = np.ascontiguousarray(shade.astype(np.uint8).T[::-1])
+    shade = np.full(occupancy.shape, _UNKNOWN, np.uint8)
+    shade[occupancy > 0] = _OCCUPIED
+    shade[occupancy == 0] = _FREE
+    picture = np.ascontiguousarray(shade.T[::-1])
     height, width = picture.shape
-    with replacing(path) as temporary:
-        temporary.write_bytes(f'P5\n{MARK}\n{width} {height}\n255\n'.encode() + picture.tobytes())
+    with replacing(path) as temporary, temporary.open('wb') as file:
+        file.write(f'P5\n{MARK}\n{width} {height}\n255\n'.encode())
+        file.write(picture.data)
     x, y = grid.origin.tolist()
     write_lines(beside(path), marked([
         f'image: {path.name}', 'mode: trinary', f'resolution: {grid.resolution}',

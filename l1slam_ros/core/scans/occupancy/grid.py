@@ -55,8 +55,10 @@ class Grid:
     @property
     def occupancy(self) -> NDArray[np.int8]:
         """100 occupied, 0 free, -1 unknown, (a, b) int8, as nav_msgs/OccupancyGrid has it."""
-        known = np.where(self.log_odds > OCCUPIED, 100, np.where(self.log_odds < FREE, 0, -1))
-        return known.astype(np.int8)
+        known = np.full(self.log_odds.shape, -1, np.int8)  # a large map has no room for wider ones
+        known[self.log_odds > OCCUPIED] = 100
+        known[self.log_odds < FREE] = 0
+        return known
 
 
 def draw(points: Sequence[Points], poses: Array, resolution: float = 0.05) -> Grid:
