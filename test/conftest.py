@@ -10,39 +10,54 @@
 
 import os
 import signal
+import socket
 import subprocess
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 
-from l1slam_ros.io.compilation import STEPS, compile_now
-from l1slam_ros.ros.shell.domain import go_where_nobody_is
-from l1slam_ros.ros.shell.middleware import use_what_is_there
+from l1slam_ros.cli.main import main
 
-# Whatever the shell says, before anything of ROS is imported, and for all that is started. No
-# robot nearby hears the tests, nor they it.
-_MIDDLEWARE = ''
-with suppress(ImportError):  # there is no ROS
-    _MIDDLEWARE = use_what_is_there()
-go_where_nobody_is()
-# Tests read what ROS logs.
-for _name in [name for name in os.environ if name.startswith('RCUTILS_')]:
+# A step of 1 m in the plane and in space, known to 1 m and 1 rad.
+IN_THE_PLANE = 'EDGE_SE2 {} {} 1 0 0 ' + '1 0 0 1 0 1'
+IN_SPACE = 'EDGE_SE3:QUAT {} {} 1 0 0 0 0 0 1 ' + '1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1'
+
+# No robot nearby hears the tests, nor they it: what the shell says of ROS is forgotten, before
+# anything of it is imported, and for all that is started.
+for _name in [name for name in os.environ
+              if name.startswith(('RCUTILS_', 'ROS_', 'RMW_', 'FASTRTPS_', 'FASTDDS_'))]:
     del os.environ[_name]
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 
-def pytest_report_header():
-    """Say what is used in place of what the shell names."""
-    return _MIDDLEWARE or None
+def _domain():
+    """Return a ROS domain, and what marks it as taken: a port that DDS leaves alone."""
+    for k in range(101):
+        domain = 1 + (os.getpid() + k) % 101
+        mark = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        with suppress(OSError):
+            mark.bind(('', 7400 + 250 * domain + 5))
+            return str(domain), mark
+        mark.close()
+    raise RuntimeError('each ROS domain is in use on this machine')
+
+
+os.environ['ROS_DOMAIN_ID'], _MARK = _domain()
 
 
 def pytest_sessionstart(session):
     """Compile before the first test: a solve that compiles takes long, and says so."""
-    if not hasattr(session.config, 'workerinput'):
-        capture = session.config.pluginmanager.getplugin('capturemanager')
-        with capture.global_and_fixture_disabled():
-            compile_now(STEPS)
+    if hasattr(session.config, 'workerinput'):
+        return
+    capture = session.config.pluginmanager.getplugin('capturemanager')
+    with capture.global_and_fixture_disabled(), TemporaryDirectory() as folder:
+        for step in (IN_THE_PLANE, IN_SPACE):
+            graph = Path(folder, 'steps.g2o')
+            graph.write_text(f'{step}\n{step}\n'.format(0, 1, 1, 2))
+            assert main(['solve', str(graph), '--output', str(Path(folder, 'solved.g2o'))]) == 0
 
 
 def pytest_collection_modifyitems(items):
