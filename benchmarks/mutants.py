@@ -42,7 +42,7 @@ PARTS = 'core', 'io', 'ros'
 SETTINGS = f"""[run]
 source_pkgs = {PACKAGE}
 parallel = true
-data_file = ${{COVERED}}/data
+data_file = ${{COVERED}}/lines
 context = ${{TEST_NOW-}}
 sigterm = true
 """
