@@ -250,7 +250,7 @@ def test_unless_it_is_managed_it_is_active_at_once(bench):
     assert state(bench()) == 'active'
 
 
-def test_publishers_that_cannot_be_heard_are_noticed(bench):
+def test_publishers_that_cannot_be_heard_are_noticed(bench, capfd):
     """The drivers of many robots publish odometry best effort; the node would wait for ever."""
     b = bench()
     b.until(lambda: b.status()[1] == 'ok', 'all is fine')
@@ -260,6 +260,8 @@ def test_publishers_that_cannot_be_heard_are_noticed(bench):
         'subscription; expected the same QoS, or qos_overrides./odom.subscription.reliability: '
         'best_effort'), 'it is said')
     assert b.status()[0] == DiagnosticStatus.WARN
+    assert "[backend]: New publisher discovered on topic 'odom', offering incompat" in (
+        capfd.readouterr().err)
     b.peer.destroy_publisher(deaf)
     b.until(lambda: b.status()[1] == 'ok', 'it is gone')
 
