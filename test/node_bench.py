@@ -18,11 +18,12 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
@@ -33,6 +34,7 @@ from l1slam_ros.ros.node import BackendNode
 from l1slam_ros.ros.scans.node import ScanLoopsNode as ScanLoopsNode
 
 DEADLINE = 120.0
+SHIPPED = File(__file__).parents[1] / 'config' / 'scan_loops.yaml'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 OF_LOOPS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SECOND = 10**8  # [ns] a second of the node's diagnostics
@@ -192,6 +194,60 @@ class Bench(Peer):
         self.backend = BackendNode(parameter_overrides=overrides)
         super().__init__(rclpy, self.backend, robots=parameters.get('robots', ()))
         self.until_heard()
+
+
+class ScanBench(Peer):
+    """The scan front end, and the back end behind it, and a peer that sends what a robot would."""
+
+    def __init__(self, rclpy, backend=False, **parameters):
+        files = ['--ros-args', '--params-file', str(SHIPPED)]
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        nodes = [ScanLoopsNode(parameter_overrides=overrides, cli_args=files)]
+        if backend:
+            nodes.append(BackendNode(cli_args=[*files, '-r', 'odom:=scan_odom']))
+        super().__init__(rclpy, *nodes)
+        self.scans = self.peer.create_publisher(LaserScan, 'scan', qos_profile_sensor_data)
+        for kind, topic, qos in ((OccupancyGrid, 'map', LATCHED), (Odometry, 'scan_odom', 1000),
+                                 (PoseWithCovarianceStamped, 'loop_closures', 1000)):
+            self.listen(kind, topic, qos)
+        self.until(lambda: self.scans.get_subscription_count()
+                   and self.publishers['/odom'].get_subscription_count(), 'the node subscribes')
+        self.until(lambda: self.scan_status()[1] and 'compiling' not in self.scan_status()[1],
+                   'its loops are compiled')
+
+    def scan_status(self):
+        return self.status('scans')
+
+    @property
+    def odometry(self):
+        """What came on scan_odom, a message for each scan that was used."""
+        return self.received['scan_odom']
+
+    def wheels_at(self, stamp, pose):
+        """Publish odometry at a stamp [ns] and a pose x, y, yaw."""
+        message = Odometry(header=header('odom', stamp), child_frame_id='base_link')
+        x, y, yaw = pose
+        put(message.pose.pose, (x, y, 0.0), (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)))
+        self.send('/odom', message)
+
+    def scan_at(self, stamp, ranges, **changes):
+        """Publish a scan of a whole turn that begins behind the robot."""
+        message = LaserScan(
+            header=header('laser', stamp), angle_min=-np.pi,
+            angle_increment=2 * np.pi / len(ranges), range_min=0.05, range_max=8.0)
+        message.ranges = np.where(ranges < 8.0, ranges, np.inf).tolist()
+        for name, value in changes.items():
+            setattr(message, name, value)
+        self.scans.publish(message)
+        self.executor.spin_once(timeout_sec=0.0)
+
+    def follow(self, ranges, wheels, ahead=2):
+        """Send scans (n, rays) and wheels (n, 3), ten a second, as fast as they are used."""
+        used = len(self.odometry)
+        for k, (seen, pose) in enumerate(zip(ranges, wheels, strict=True)):
+            self.scan_at((k + 10) * 10**8, seen)
+            self.wheels_at((k + 10) * 10**8, pose)
+            self.until(lambda n=k: len(self.odometry) - used >= n - ahead, 'scans are used')
 
 
 def header(frame, stamp):
