@@ -18,16 +18,11 @@ from pathlib import Path
 
 import pytest
 from test_demo import NOBODYS, ODD
-from test_introspection import INPUTS, OUTPUTS, PARAMETERS, SERVICES
+from test_introspection import ELSEWHERE, INPUTS, OUTPUTS, PARAMETERS, SERVICES
 
 pytest.importorskip('rclpy')
 
 from node_bench import DEADLINE, executable
-
-ELSEWHERE = {
-    '/map_graph', '/pose_graph', '/slam_toolbox/pose_graph', '/slam_toolbox/new_node_event',
-    '/cslam/keyframe_odom', '/cslam/intra_robot_loop_closure', '/cslam/inter_robot_loop_closure',
-    '/tf'}
 
 
 def run(*command, **variables):

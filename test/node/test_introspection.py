@@ -86,6 +86,7 @@ def test_topics_and_services_are_those_of_the_interface(bench):
                                  b.peer.get_service_names_and_types_by_node)]
 
     b.until(lambda: named() == [INPUTS, OUTPUTS, SERVICES], 'this is found, and nothing else')
+    assert state(b) == 'active', 'unless it is managed'
     for topic in INPUTS:
         (end,) = b.peer.get_subscriptions_info_by_topic(topic)
         assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
@@ -216,29 +217,26 @@ def test_a_node_that_is_managed_does_as_it_is_told(bench, tmp_path):
     b = bench(autostart=False, save_path=str(path))
     assert not change(b, Transition.TRANSITION_ACTIVATE) and state(b) == 'unconfigured'
     b.send('/odom', odometry(10**9, 0.0))
-    b.until(lambda: b.status()[2].get('odom.received') == '1', 'it has come')
+    b.until(lambda: b.count('odom.received') == 1, 'it has come')
     assert not b.received['pose'] and not b.received['map_to_odom']
     assert change(b, Transition.TRANSITION_CONFIGURE) and state(b) == 'inactive'
     assert change(b, Transition.TRANSITION_ACTIVATE) and state(b) == 'active'
     b.drive(1, 3)
-    b.until(lambda: len(b.path().poses) == 2 and b.received['map_to_odom'], 'a map')
+    b.map_of(2)
+    b.until(lambda: b.received['map_to_odom'], 'a transform')
     assert len(b.received['pose']) == 2
     assert change(b, Transition.TRANSITION_DEACTIVATE)
     b.drive(3, 4)
-    b.until(lambda: b.status()[2].get('odom.received') == '4', 'it has come')
+    b.until(lambda: b.count('odom.received') == 4, 'it has come')
     assert change(b, Transition.TRANSITION_CLEANUP) and state(b) == 'unconfigured'
-    b.until(lambda: not b.path().poses, 'the map is empty')
+    b.map_of(0)
     b.until(path.exists, 'it is saved; the next autosave would be a minute later')
     assert l1.read_graph(path)[0].n_poses == 2
     assert change(b, Transition.TRANSITION_CONFIGURE) and change(b, Transition.TRANSITION_ACTIVATE)
     assert change(b, Transition.TRANSITION_ACTIVE_SHUTDOWN) and state(b) == 'finalized'
     b.drive(4, 5)
-    b.until(lambda: b.status()[2].get('odom.received') == '5', 'it has come')
+    b.until(lambda: b.count('odom.received') == 5, 'it has come')
     assert len(b.received['pose']) == 2
-
-
-def test_unless_it_is_managed_it_is_active_at_once(bench):
-    assert state(bench()) == 'active'
 
 
 def test_publishers_that_cannot_be_heard_are_noticed(bench, capfd):

@@ -18,7 +18,8 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from node_bench import DEADLINE, Peer, call, poses_of, set_parameter
+from node_bench import DEADLINE, Peer, call, odometry, poses_of, set_parameter
+from worlds import as_map, edge
 
 import l1slam_ros as l1
 
@@ -91,7 +92,7 @@ def hold_nonsense(path):
 
 def test_where_the_contents_of_a_map_are_wrong_the_one_before_is_loaded(bench, tmp_path, capfd):
     path, before = tmp_path / 'map.g2o', tmp_path / 'map.g2o.1'
-    first = bench(save_path=str(path))
+    first = bench(save_path=str(path), autosave_period=0.0)  # nothing is saved when it ends
     for last in 4, 5:
         first.drive(0 if last == 4 else 4, last)
         first.map_of(last)
@@ -117,6 +118,21 @@ def test_where_the_contents_of_a_map_are_wrong_the_one_before_is_loaded(bench, t
     assert not answer.success and answer.message.count('wrong contents') == 2
     third.drive(0, 3)
     third.map_of(3)
+
+
+def test_a_large_map_is_published_whenever_it_has_grown(bench, tmp_path):
+    """By a thread of its own, which rests in between."""
+    path, many = tmp_path / 'map.g2o', 10_002
+    path.write_text('\n'.join(edge(k, k + 1, (1.0, 0.0, 0.0), 100 * np.eye(3))
+                              for k in range(many - 1)) + '\n')
+    b = bench(save_path=str(as_map(path)), load_on_start=True)
+    b.map_of(many)
+    for last in 3, 6:
+        for k in range(last - 3, last):
+            b.send('/odom', odometry((20_000 + k) * 10**9, 1.0 * k))
+        poses = poses_of(b.map_of(many + last))
+    np.testing.assert_allclose(poses[:many, 0], np.arange(many), atol=1e-3)
+    np.testing.assert_allclose(poses[many:, 0], many - 1 + np.arange(6), atol=1e-3)
 
 
 def kept_in(folder):

@@ -67,16 +67,20 @@ def test_the_graph_is_drawn_for_who_looks_also_for_who_comes_late(bench, tmp_pat
     path = np.array([(p.pose.position.x, p.pose.position.y) for p in b.path().poses])
     drawn = np.array([(p.x, p.y) for p in late.drawn['keyframes', 0].points])
     np.testing.assert_allclose(drawn, path, atol=2e-3)
-    b.rest()
-    sigmas = [sigmas for state, sigmas in b.loops().values() if state == 'accepted']
     loops = late.drawn['loops', 0]
     assert (loops.type, loops.scale.x) == (Marker.LINE_LIST, 0.05)
     assert (late.drawn['keyframes', 0].type, late.drawn['keyframes', 0].scale.x) == (
         Marker.POINTS, 0.12)
-    # From green over yellow, at 2.5 sigmas, to red, at 5.
-    for k, one in enumerate(loops.colors):
-        red = np.interp(sigmas[k // 2], (0, 2.5, 5), (0, 0.902, 0.835))
-        assert one.r == pytest.approx(red, abs=0.02) and one.a == 1.0
+    # From green over yellow, at half of the worst, to red.
+    for one in loops.colors:
+        sure = one.r, np.interp(one.r, (0, 0.902), (0.62, 0.624)), np.interp(
+            one.r, (0, 0.902), (0.451, 0))
+        unsure = one.r, np.interp(one.r, (0.835, 0.902), (0.216, 0.624)), np.interp(
+            one.r, (0.835, 0.902), (0.055, 0))
+        assert min(np.abs(np.subtract((one.r, one.g, one.b), ladder)).max()
+                   for ladder in (sure, unsure)) < 0.02 and one.a == 1.0
+    assert min(one.r for one in loops.colors) < 0.3 < max(one.r for one in loops.colors)
+    assert {(one.r, one.a) for one in late.drawn['odometry', 0].colors} == {(0.5, 1.0)}
 
 
 def test_a_person_strikes_a_loop_out_and_vouches_for_it_after_all(bench):
