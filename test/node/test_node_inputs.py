@@ -87,6 +87,8 @@ def test_two_publishers_of_odometry_are_told_of(bench, capfd):
         b.drive(2 * k, 2 * k + 1)
         other.publish(odometry((2 * k + 2) * 10**9, 5.0))
         b.until(lambda n=2 * k + 2: b.newest() == n * 10**9, 'it is used')
+    b.anew()
+    assert (b.count('odom.received'), b.count('odom.lost')) == (12, 0)
     told = warnings(capfd)
     assert len(told) == 1 and told[0].endswith(
         'messages of several publishers come by turns on odom, and the map takes them for one '

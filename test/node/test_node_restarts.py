@@ -39,6 +39,7 @@ def test_another_publisher_makes_a_small_jump_a_restart(bench, capfd, restarts):
     b.anew()
     assert b.count('keyframes') - 1 - b.count('factors') == restarts
     assert b.count('odometry.new_part') == restarts and not b.refused()
+    assert (b.count('odom.received'), b.count('odom.lost')) == (60, 0)
     told = warnings(capfd)
     if restarts:
         b.until(lambda: told.extend(warnings(capfd)) or told, 'it is told of')

@@ -13,9 +13,13 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from corridors import RAYS, by_wheels, laps, ranges_from
+from corridors import RAYS, WALLS, by_wheels, laps, ranges_from
 from node_bench import ScanBench, call, poses_of, stamp_of
 from worlds import compose, position_error
+
+# A hall that is nothing like the rooms [m].
+ELSEWHERE = np.array([(-2.0, -1.0, 19.0, -4.0), (19.0, -4.0, 17.0, 3.1), (17.0, 3.1, 6.0, 2.4),
+                      (6.0, 2.4, 4.0, 5.5), (4.0, 5.5, -2.0, 4.2), (-2.0, 4.2, -2.0, -1.0)])
 
 
 def test_two_laps_make_a_map(ros, tmp_path, rng):
@@ -61,3 +65,19 @@ def test_two_laps_make_a_map(ros, tmp_path, rng):
     assert not refused.success and f'{mine}: was not written by l1slam_ros' in refused.message
     assert kept == (mine.read_bytes(), (tmp_path / 'corridors.pgm').read_bytes())
     assert r.close(), 'its threads end'
+
+
+def test_where_scans_show_nothing_known_a_part_begins_for_the_back_end_too(ros, capfd):
+    r = ScanBench(ros, backend=True, laser_pose='0 0 0')
+    truth = np.array([(1.6 + 0.2 * k, 1.6, 0.0) for k in range(40)])
+    # The robot is carried into another room while its wheels go on.
+    walls = [WALLS if k < 12 else ELSEWHERE for k in range(40)]
+    r.follow([ranges_from(pose, walls=seen) for pose, seen in zip(truth, walls, strict=True)],
+             truth, ahead=0)
+    r.until(lambda: r.scan_status()[2]['parts'] == '2', 'a part of the scans')
+    r.until(lambda: r.count('odometry.new_part') == 1, 'a part of the map')
+    x = np.array([message.pose.pose.position.x for message in r.odometry])
+    (jump,) = np.flatnonzero(np.diff(x) > 1)
+    assert jump > 12 and np.diff(x)[jump] == pytest.approx(1000, abs=1)
+    assert 'nothing known any more; a new part of the map begins' in capfd.readouterr().err
+    assert r.close()
