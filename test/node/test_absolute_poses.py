@@ -36,8 +36,7 @@ def test_a_world_seen_by_gps_is_saved_and_goes_on(bench, tmp_path):
     l1.write_graph(tmp_path / 'bag', world.graph, poses)
     b = bench(save_path=str(tmp_path / 'map.g2o'), **EVERY_MESSAGE)
     b.play(tmp_path / 'bag')
-    b.until(lambda: len(b.path().poses) == 200, 'all keyframes')
-    keyframes = [stamp_of(pose.header) for pose in b.path().poses]
+    keyframes = [stamp_of(pose.header) for pose in b.map_of(200).poses]
 
     def refused():
         ends = {end for (_, end), (state, _) in b.loops().items() if state != 'accepted'}
@@ -49,12 +48,11 @@ def test_a_world_seen_by_gps_is_saved_and_goes_on(bench, tmp_path):
     b.until(lambda: world.error(poses_of(b.path())) < 0.6, 'the Path is in the world')
     assert refused() == world.false.tolist()
     assert call(b, 'save').success and call(b, 'reset').success
-    b.until(lambda: not b.path().poses, 'the map is empty')
+    b.map_of(0)
     b.received['loop_status'].clear()
     assert call(b, 'load').success
     _, before = l1.read_graph(tmp_path / 'map.g2o')
-    b.until(lambda: b.path().poses, 'the map is back')
-    np.testing.assert_allclose(poses_of(b.path()), before, atol=1e-6)
+    np.testing.assert_allclose(poses_of(b.map_of(200)), before, atol=1e-6)
     b.until(lambda: len(b.loops()) == 20 and refused() == world.false.tolist(),
             'they are judged anew')
     # The robot drives ten metres on, straight ahead, and GPS sees it there.
@@ -78,7 +76,6 @@ def test_what_is_not_of_the_map_frame_or_says_nothing_is_counted(bench):
                     fix(10**9, (1.0, 2.0), variance=0.0)):
         b.send('/absolute_poses', message)
     b.send('/absolute_poses', fix(2 * 10**9, (30.0, 2.0)))
-    b.until(lambda: b.status()[2].get('refused.frame') == '2', 'those of other frames are counted')
-    b.until(lambda: b.status()[2].get('refused.covariance') == '1', 'so is what says nothing')
+    b.until(lambda: b.refused() == {'frame': 2, 'covariance': 1}, 'they are counted')
     b.until(lambda: b.path().poses and b.path().poses[-1].pose.position.x == pytest.approx(30),
             'the one that is left puts the map in its place')

@@ -33,7 +33,7 @@ def test_when_the_clock_jumps_back(bench, tmp_path, choice):
 
     tell(100)
     b.drive(0, 3)
-    b.until(lambda: len(b.path().poses) == 3, 'a map, though the clock stands still')
+    b.map_of(3)  # though the clock stands still
     tell(101)
     tell(50)
     for _ in range(2 if choice == 'new_segment' else 0):
@@ -44,7 +44,7 @@ def test_when_the_clock_jumps_back(bench, tmp_path, choice):
         quiet = not b.received['map_to_odom']
     assert choice != 'new_segment' or quiet
     if choice == 'reset':
-        b.until(lambda: len(b.path().poses) == 0, 'the map begins anew')
+        b.map_of(0)
         b.until((tmp_path / 'map.g2o').exists, 'what was is saved')
         assert l1.read_graph(tmp_path / 'map.g2o')[0].n_poses == 3
         b.drive(0, 2)
@@ -52,8 +52,7 @@ def test_when_the_clock_jumps_back(bench, tmp_path, choice):
         b.drive(*((3, 5) if choice == 'ignore' else (0, 2)))
     # A part that begins where the last one ends begins with a keyframe there.
     expected, end = {'new_segment': (5, 3.0), 'reset': (2, 1.0), 'ignore': (5, 4.0)}[choice]
-    b.until(lambda: len(b.path().poses) == expected, f'the map has {expected} keyframes')
-    assert poses_of(b.path())[-1, 0] == pytest.approx(end)
+    assert poses_of(b.map_of(expected))[-1, 0] == pytest.approx(end)
 
 
 def test_the_jump_of_the_transform_is_said(bench):
@@ -63,7 +62,7 @@ def test_the_jump_of_the_transform_is_said(bench):
     """
     b = bench()
     b.drive(0, 6)
-    b.until(lambda: len(b.path().poses) == 6, 'a map')
+    b.map_of(6)
     b.send('/trusted_loop_closures', loop(6 * 10**9, 4.0, variance=1e-8))
     b.until(lambda: 0.01 < float(b.status()[2].get('jump.translation', 0)) < 1.01, 'a jump')
     b.until(lambda: b.path().poses[-1].pose.position.x == pytest.approx(4.0, abs=0.01),

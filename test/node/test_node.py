@@ -15,18 +15,7 @@ pytest.importorskip('rclpy')
 
 from command import solve_json
 from diagnostic_msgs.msg import DiagnosticStatus
-from node_bench import (
-    EVERY_MESSAGE,
-    Bench,
-    call,
-    loop,
-    odometry,
-    parameters_of,
-    poses_of,
-    set_parameter,
-    stamp_of,
-)
-from std_srvs.srv import SetBool, Trigger
+from node_bench import EVERY_MESSAGE, begin, call, odometry, pause, poses_of, stamp_of
 from worlds import as_map, made, off_by, torn, whitened
 
 import l1slam_ros as l1
@@ -37,7 +26,7 @@ def test_a_recorded_world_becomes_its_optimal_map_and_all_topics_agree(bench, tm
     graph = write_world(tmp_path / 'bag', 300, 500).graph
     b = bench(**EVERY_MESSAGE)
     b.play(tmp_path / 'bag')
-    b.until(lambda: len(b.path().poses) == 300, 'all keyframes are in the Path')
+    b.map_of(300)
     b.until(lambda: b.count('factors') == len(graph.between),
             'no message was lost on the way')
     most = 1.02 * l1.solve(graph, robust=False).cost
@@ -56,64 +45,25 @@ def test_a_recorded_world_becomes_its_optimal_map_and_all_topics_agree(bench, tm
     assert ahead[0] >= 10**8 and (np.diff(ahead) > 0).all()
 
 
-def test_transforms_reach_to_the_odometry_that_comes_next(bench):
-    """That of a bag played fast, or that comes seldom: by more than the tolerance."""
-    b = bench(transform_period=3600.0)
-    for k in range(5):
-        b.drive(k, k + 1)
-        b.until(lambda k=k: len(b.received['map_to_odom']) == k + 2, 'a transform with a message')
-    # tf2 looks up between two: at first, before it is known how seldom, one at the stamp itself.
-    assert [stamp_of(message.header) for message in b.received['map_to_odom']] == [
-        10**9, 13 * 10**8, 23 * 10**8, 45 * 10**8, 55 * 10**8, 65 * 10**8]
-
-
 def test_default_thresholds_make_a_keyframe_every_half_metre(bench):
     b = bench()
     for k in range(101):
         b.send('/odom', odometry(10**9 + k * 10**8, 0.05 * k))
-    b.until(lambda: len(b.path().poses) == 11, 'eleven keyframes came of five metres')
+    b.map_of(11)
     b.until(lambda: b.received['pose'][-1].header.stamp.sec == 11, 'the last one is answered')
-
-
-def test_bad_messages_are_counted_and_the_node_goes_on(bench):
-    b = bench()
-    b.send('/odom', odometry(10**9, 0.0))
-    b.send('/odom', odometry(10**9 - 5, 9.0))
-    b.send('/odom', odometry(2 * 10**9, float('nan')))
-    b.send('/odom', odometry(2 * 10**9, 0.0, frame='camera'))
-    b.send('/loop_closures', loop(2 * 10**9, frame='map'))
-    b.send('/odom', odometry(3 * 10**9, 1.0))
-    b.until(lambda: len(b.path().poses) == 2, 'the good samples are in the Path')
-    b.until(lambda: sum(b.refused().values()) == 4, 'the four bad ones are counted')
-    assert b.refused() == {'old_stamp': 1, 'not_finite': 1, 'child_frame': 1, 'frame': 1}
-    level, sentence, values = b.status()
-    assert level == DiagnosticStatus.WARN and '1 not_finite' in sentence
-    assert values['refused.not_finite.last_minute'] == '1'
-    assert (values['odom.received'], values['loop_closures.received']) == ('5', '1')
-
-
-def test_nonsense_parameters_are_refused_at_start_and_on_set(ros, bench):
-    with pytest.raises(l1.L1SlamError, match=r'keyframe\.translation'):
-        Bench(ros, {'keyframe.translation': -1.0})
-    b = bench(**{'keyframe.rotation': 1})
-    assert parameters_of(b, 'keyframe.rotation') == [1.0]
-    assert 'translation' in set_parameter(b, 'keyframe.translation', float('nan'))
-    assert set_parameter(b, 'map_frame', 'world')
-    assert not set_parameter(b, 'update.budget', 0.05)
-    assert parameters_of(b, 'update.budget', 'map_frame') == [0.05, 'map']
 
 
 def test_a_saved_map_is_loaded_and_odometry_goes_on_from_its_end(bench, tmp_path):
     b = bench(save_path=str(tmp_path / 'map.g2o'))
     assert not call(b, 'save').success
     b.drive(0, 3)
-    b.until(lambda: len(b.path().poses) == 3, 'three keyframes')
+    b.map_of(3)
     assert call(b, 'save').success
     assert call(b, 'reset').success
-    b.until(lambda: len(b.path().poses) == 0, 'the map is empty')
+    b.map_of(0)
     answer = call(b, 'load')
     assert answer.success and '3 keyframes' in answer.message
-    b.until(lambda: len(b.path().poses) == 3, 'the map is back')
+    b.map_of(3)
     # The robot was switched off meanwhile: its odometry begins at 50 m, a part begins there.
     b.send('/odom', odometry(10 * 10**9, 50.0))
     b.send('/odom', odometry(11 * 10**9, 50.1))
@@ -125,8 +75,7 @@ def test_a_saved_map_is_loaded_and_odometry_goes_on_from_its_end(bench, tmp_path
     b.until(lambda: b.received['map_to_odom'], 'a transform')
     assert b.received['map_to_odom'][-1].transform.translation.x == pytest.approx(-48.0)
     b.send('/odom', odometry(12 * 10**9, 51.0))
-    b.until(lambda: len(b.path().poses) == 5, 'a keyframe after the load')
-    np.testing.assert_allclose(poses_of(b.path())[:, 0], [0, 1, 2, 2, 3], atol=1e-9)
+    np.testing.assert_allclose(poses_of(b.map_of(5))[:, 0], [0, 1, 2, 2, 3], atol=1e-9)
     b.send('/odom', odometry(13 * 10**9, 51.1))
     b.until(lambda: b.received['pose'][-1].header.stamp.sec == 13, 'a pose after the update')
     assert b.received['pose'][-1].pose.position.x == pytest.approx(3.1)
@@ -138,7 +87,7 @@ def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, 
     b = bench(save_path=str(tmp_path / 'broken.g2o'), autosave_period=0.0, **EVERY_MESSAGE)
     assert call(b, 'optimize').message == 'there are no factors yet'
     b.play(tmp_path / 'bag')
-    b.until(lambda: len(b.path().poses) == 60, 'all keyframes')
+    b.map_of(60)
     answer = call(b, 'optimize')
     assert answer.success and 'L1 cost' in answer.message
     answer = call(b, 'load')
@@ -151,11 +100,9 @@ def test_optimize_takes_a_doubtful_map_and_says_so(bench, tmp_path, capsys):
     as_map(tmp_path / 'map.g2o')
     expected = solve_json(capsys, tmp_path / 'map.g2o', code=4)
     b = bench(save_path=str(tmp_path / 'map.g2o'))
-    # Or an update could change the map before the service does.
-    assert call(b, 'pause', SetBool.Request(data=True)).success
+    pause(b, True)  # or an update could change the map before the service does
     assert call(b, 'load').success
-    b.until(lambda: len(b.path().poses) == 400, 'the map is there')
-    before = poses_of(b.path())
+    before = poses_of(b.map_of(400))
     answer = call(b, 'optimize')
     reasons = '; '.join(doubt['text'] for doubt in expected['doubts'])
     assert not answer.success and answer.message.startswith(f'doubtful: {reasons}. ')
@@ -173,37 +120,29 @@ def test_optimize_takes_a_doubtful_map_and_says_so(bench, tmp_path, capsys):
 
 def test_no_update_while_paused(bench):
     b = bench()
-    assert call(b, 'pause', SetBool.Request(data=True)).success
+    pause(b, True)
     b.send('/odom', odometry(10**9, 0.0))
     b.until(lambda: b.received['pose'], 'poses go on')
     ticks = len(b.received['map_to_odom'])
     b.until(lambda: len(b.received['map_to_odom']) > ticks + 3, 'the timer goes on')
     assert not b.received['path']
-    assert call(b, 'pause', SetBool.Request(data=False)).success
-    b.until(lambda: len(b.path().poses) == 1, 'the update is made up for')
+    pause(b, False)
+    b.map_of(1)
 
 
-def test_an_offset_that_loops_share_is_in_the_answer(bench, tmp_path):
-    as_map(off_by(made(tmp_path / 'map.g2o', 400, 1000), (-0.3, 0.4, 0.05)))
-    b = bench(save_path=str(tmp_path / 'map.g2o'))
+def test_the_solver_never_starves_the_callbacks_and_names_an_offset_of_loops(bench, tmp_path):
+    as_map(off_by(made(tmp_path / 'map.g2o', 1500, 2600), (-0.3, 0.4, 0.05)))
+    b = bench(save_path=str(tmp_path / 'map.g2o'), autosave_period=0.0)
     assert call(b, 'load').success
-    answer = call(b, 'optimize')
-    assert answer.success and '; loops share an offset of 0.' in answer.message
-
-
-def test_the_solver_never_starves_the_callbacks(bench, tmp_path):
-    as_map(made(tmp_path / 'map.g2o', 1500, 2600))
-    b = bench(save_path=str(tmp_path / 'map.g2o'))
-    assert call(b, 'load').success
-    client = b.peer.create_client(Trigger, '/backend/optimize')
-    b.until(client.service_is_ready, 'optimize is offered')
-    answer = client.call_async(Trigger.Request())
+    answer = begin(b, 'optimize')
     for k in range(20):
         b.send('/odom', odometry((10 + k) * 10**9, 0.1 * k))
-    b.until(lambda: b.received['pose'] and b.received['pose'][-1].header.stamp.sec == 29,
-            'odometry is answered')
+    b.until(lambda: b.newest() == 29 * 10**9, 'odometry is answered')
     assert not answer.done(), 'the solver was done before the callbacks: make the world larger'
     b.until(answer.done, 'the solver answers')
     # What was driven meanwhile no loop joins to the map that was loaded.
     found = answer.result()
     assert found.success or ' joins 2 parts of the map' in found.message
+    assert call(b, 'load').success
+    answer = call(b, 'optimize')
+    assert answer.success and '; loops share an offset of 0.' in answer.message

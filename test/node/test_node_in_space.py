@@ -55,7 +55,7 @@ def test_what_front_ends_in_space_send_makes_a_map(
             b.send('/loop_closures', said(PoseWithCovarianceStamped(header=header(
                 f'body@{factors.i[row] + 1}.000000000', (k + 1) * NS)),
                 factors.measurement[row], of_loops))
-    b.until(lambda: len(b.path().poses) == KEYFRAMES, 'a map of all')
+    b.map_of(KEYFRAMES)
     answer = call(b, 'optimize')
     assert answer.success and 'times what is stated' in answer.message
     truth = np.loadtxt(f'{path}.truth.txt')[:, 1:4]

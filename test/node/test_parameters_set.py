@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the node that are set while it runs, and lists that are empty."""
+"""Parameters of the node: nonsense, those set while it runs, and lists that are empty."""
 
 import re
 from pathlib import Path
@@ -15,9 +15,11 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from node_bench import call, parameters_of
+from node_bench import Bench, call, parameters_of
 from node_bench import set_parameter as put
 from rcl_interfaces.srv import DescribeParameters, ListParameters
+
+import l1slam_ros as l1
 
 
 def test_a_shorter_period_of_the_updates_holds_at_once(bench):
@@ -25,9 +27,9 @@ def test_a_shorter_period_of_the_updates_holds_at_once(bench):
     b.drive(0, 3)
     b.until(lambda: b.received['pose'], 'odometry is used')
     assert not put(b, 'update.period', 0.05)
-    b.until(lambda: len(b.path().poses) == 3, 'the map is updated')
+    b.map_of(3)
     b.drive(3, 6)
-    b.until(lambda: len(b.path().poses) == 6, 'it is updated again')
+    b.map_of(6)
 
 
 def test_a_shorter_period_of_the_transform_holds_from_the_next_odometry_on(bench):
@@ -40,11 +42,18 @@ def test_a_shorter_period_of_the_transform_holds_from_the_next_odometry_on(bench
     b.until(lambda: len(b.received['map_to_odom']) > count + 4, 'it is published again and again')
 
 
-@pytest.mark.parametrize('name, value', [
-    ('update.period', 0.0), ('update.period', float('nan')), ('transform_period', -1.0)])
-def test_a_period_that_is_none_is_refused(bench, name, value):
-    reason = put(bench(), name, value)
-    assert name in reason and str(value) in reason
+def test_nonsense_is_refused_at_start_and_on_set(ros, bench):
+    with pytest.raises(l1.L1SlamError, match=r'keyframe\.translation'):
+        Bench(ros, {'keyframe.translation': -1.0})
+    b = bench(**{'keyframe.rotation': 1})
+    assert parameters_of(b, 'keyframe.rotation') == [1.0]
+    for name, value in (('update.period', 0.0), ('update.period', float('nan')),
+                        ('transform_period', -1.0), ('keyframe.translation', float('nan'))):
+        reason = put(b, name, value)
+        assert name in reason and str(value) in reason
+    assert put(b, 'map_frame', 'world')
+    assert not put(b, 'update.budget', 0.05)
+    assert parameters_of(b, 'update.budget', 'map_frame') == [0.05, 'map']
 
 
 def test_what_is_read_at_start_only_is_refused_by_its_name(bench):
@@ -66,4 +75,4 @@ def test_an_empty_list_of_robots_is_the_default(bench):
     """To ROS it has no type: it comes as no value at all."""
     b = bench(robots=[])
     b.drive(0, 2)
-    b.until(lambda: len(b.path().poses) == 2, 'a single robot has its map')
+    b.map_of(2)
