@@ -8,6 +8,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """When motion makes a keyframe, and what is known of the motion between two."""
 
+from itertools import zip_longest
+
 import heard
 import numpy as np
 import pytest
@@ -21,20 +23,18 @@ MODEL = {'odometry.sigma_translation': 0.1, 'odometry.sigma_rotation': 0.2,
          'odometry.floor_translation': 0.03, 'odometry.floor_rotation': 0.04}
 
 
-def after(increments, covariances=None, twists=None, source='model', every=False, period=1.0,
-          **options):
+def after(increments, covariances=(), twists=(), source='model', period=1.0, **options):
     """Return the back end after increments (k, 3), one message each; only the last a keyframe."""
-    count = len(increments)
     backend = heard.begun(heard.EVERY, **MODEL, **{
-        'keyframe.period': 0.0 if every else count * period,
-        'odometry.covariance_source': source, **options})
+        'keyframe.period': len(increments) * period, 'odometry.covariance_source': source,
+        **options})
     poses = [np.zeros(3)]
     for increment in increments:
         poses.append(compose(poses[-1], np.array(increment, float)))
-    unset = [heard.UNKNOWN] * count
-    stated = ([heard.UNKNOWN, *(given or unset)] for given in (covariances, twists))
-    for k, (pose, covariance, twist) in enumerate(zip(poses, *stated, strict=True)):
-        backend.add_odometry(heard.odometry(5.0 + k * period, pose, covariance, twist))
+    stated = zip_longest(poses, [heard.UNKNOWN, *covariances], [heard.UNKNOWN, *twists],
+                         fillvalue=heard.UNKNOWN)
+    for k, sample in enumerate(stated):
+        backend.add_odometry(heard.odometry(5.0 + k * period, *sample))
     return backend
 
 
@@ -56,13 +56,19 @@ def test_any_threshold_that_is_on_makes_a_keyframe(thresholds, increments, perio
     assert backend.snapshot().stamps.tolist() == expected
 
 
-@pytest.mark.parametrize('increments, way, turn', [
+@pytest.mark.parametrize('increments, source, stated', [
     # 3 + 4 m and .5 + .25 rad travelled, not the 1 m and .25 rad between the ends.
-    ([(3.0, 0, 0.5), (-4.0, 0, -0.25)], 0.7, 0.15), ([(0.0, 0, 0)] * 3, 0.0, 0.0)])
-def test_the_model_grows_with_the_way_and_the_turn_whatever_messages_say(increments, way, turn):
-    stated = [np.eye(6)] * len(increments)
-    (covariance,) = heard.steps_of(after(increments, stated, stated))[1]
-    assert_allclose(covariance, np.diag([way**2 + 0.03**2] * 2 + [turn**2 + 0.04**2]), atol=1e-12)
+    ([(3.0, 0, 0.5), (-4.0, 0, -0.25)], 'model', 2 * [np.eye(6)]),
+    ([(0.0, 0, 0)] * 3, 'model', 3 * [np.eye(6)]),
+    ([(0.0, 0, 0)] * 1100, 'increment', [heard.UNKNOWN, *[np.eye(6)] * 1099]),
+    *(([(1.0, 0, 0.1)] * 3, source, [np.eye(6)] * place + [one] + [np.eye(6)] * (2 - place))
+      for source in ('increment', 'twist') for one in heard.UNUSABLE for place in range(3))])
+def test_the_model_grows_with_the_way_and_the_turn(increments, source, stated):
+    """It speaks for the whole motion where it is asked to, or one covariance is unusable."""
+    (covariance,) = heard.steps_of(after(increments, stated, stated, source))[1]
+    way, turn = (np.abs(np.array(increments)[:, k]).sum() for k in (0, 2))
+    expected = [(0.1 * way)**2 + 0.03**2] * 2 + [(0.2 * turn)**2 + 0.04**2]
+    assert_allclose(covariance, np.diag(expected), atol=1e-12)
 
 
 @pytest.mark.parametrize('source', ['increment', 'twist'])
@@ -85,24 +91,6 @@ def test_what_messages_state_adds_up_to_first_order(rng, source, count):
     (measurement,), (covariance,) = heard.steps_of(backend)
     assert_allclose(between(rest, measurement), 0, atol=1e-9)
     assert_allclose(covariance, expected, rtol=1e-5, atol=1e-9)
-
-
-@pytest.mark.parametrize('source', ['increment', 'twist'])
-@pytest.mark.parametrize('unusable', heard.UNUSABLE)
-def test_one_unusable_covariance_and_the_model_speaks_for_the_whole_motion(source, unusable):
-    model = np.diag([0.3**2 + 0.03**2] * 2 + [0.06**2 + 0.04**2])
-    for place in range(3):
-        covariances = [np.eye(6)] * 3
-        covariances[place] = unusable
-        backend = after([(1.0, 0, 0.1)] * 3, covariances, covariances, source)
-        assert_allclose(heard.steps_of(backend)[1], [model])
-
-
-def test_one_message_without_a_covariance_among_hundreds_leaves_the_model():
-    stated = [np.eye(6)] * 1100
-    stated[3] = heard.UNKNOWN
-    covariance = heard.steps_of(after([(0.0, 0, 0)] * 1100, stated, source='increment'))[1]
-    assert_allclose(covariance, [np.diag([0.03**2] * 2 + [0.04**2])])
 
 
 @pytest.mark.parametrize('variances, used, said', [

@@ -77,30 +77,6 @@ def test_a_true_loop_becomes_the_true_pose_between_the_nearest_keyframes(
     assert heard.refused(backend) == {'before_start': 1, 'same_keyframe': 1}
 
 
-def test_a_loop_between_two_samples_is_interpolated():
-    """On a straight line at 1 m/s: exact."""
-    backend = heard.driven(heard.straight(100, heard.PERIOD), {},
-                           heard.loop(1.03, 7.77, (6.74, 0.0, 0.0)))
-    (i,), (j,), measurement, _ = heard.loops_of(backend)
-    assert_allclose(backend.poses[[i, j], 0], [1.0, 8.0])
-    assert_allclose(measurement, [[7.0, 0, 0]], atol=1e-9)
-
-
-def test_a_loop_before_its_odometry_gives_the_same_factor():
-    """With every message a keyframe; else a late loop may find a nearer keyframe."""
-    poses, found = heard.curve(200), []
-    loops = [heard.true_loop(poses, *pair) for pair in ((7, 151), (33, 188), (2, 90))]
-    for before, waiting in (200, []), (100, loops[:2]), (0, loops):
-        backend = heard.driven(poses[:before], heard.EVERY, *loops)
-        assert listed(backend, WAITING) == stamps_of(*waiting)
-        heard.drive_on(backend, poses, before)
-        order = np.lexsort(heard.loops_of(backend)[:2])
-        found.append([np.array(column)[order] for column in heard.loops_of(backend)])
-    for other in found[1:]:
-        for ours, theirs in zip(other, found[0], strict=True):
-            assert_array_equal(ours, theirs)
-
-
 def test_what_waits_too_long_expires_and_may_be_sent_again():
     """A strike, too, which is no loop."""
     poses = heard.curve(100)
@@ -119,20 +95,6 @@ def test_what_waits_too_long_expires_and_may_be_sent_again():
     heard.drive_on(backend, poses[:70], 32).add_loop(long)
     assert listed(backend, *IN_GRAPH) == stamps_of(short, long)
     assert heard.refused(backend) == {'expired': 3}
-
-
-@pytest.mark.parametrize('late', [False, True])
-def test_a_word_counts_for_the_loops_that_came_before_it(late):
-    """Though all of them waited for odometry, and become factors together."""
-    poses, driven = heard.curve(50), 20 if late else 50
-    one = heard.true_loop(poses, 3, 30)
-    backend = heard.driven(poses[:driven], {}, one, replace(one, struck=True),
-                           replace(one, trusted=True, pose3=heard.pose3((1, 0, 0))),
-                           replace(one, pose3=heard.pose3((2, 0, 0))))
-    heard.drive_on(backend, poses, driven)
-    rows, factors = backend.loop_states().rows, backend.snapshot().graph.between
-    assert factors.struck[rows].tolist() == [True, False, False]
-    assert factors.trusted[rows].tolist() == [False, True, False]
 
 
 def test_other_measurements_of_a_pair_are_other_loops():
