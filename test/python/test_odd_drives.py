@@ -14,8 +14,6 @@ import pytest
 from numpy.testing import assert_allclose
 from worlds import compose
 
-import l1slam_ros as l1
-
 MINUTE = 60.0  # [s] The longest pause without a doubt.
 AGAIN = {'new_part': 1}
 
@@ -112,17 +110,3 @@ def test_only_what_is_no_motion_is_told_of(samples, told):
         assert not errors
         found = np.array([one.pose3[:2] for one in samples])
         assert_allclose(backend.snapshot().odometry[:, :2], found, atol=1e-9)
-
-
-@pytest.mark.parametrize('name', ['intel.g2o', 'real/fr079.graph', 'real/kitti_00.g2o'])
-def test_no_recorded_graph_is_taken_for_a_fault(datasets, name):
-    """Its chain, a pose every .1 s and as fast as stamps can follow each other."""
-    factors = l1.read_graph(datasets / name)[0].between
-    poses = [np.zeros(3)]
-    for step in factors.measurement[factors.step_to[1:]]:
-        poses.append(compose(poses[-1], step))
-    for period in 0.1, 0.001:
-        backend = heard.begun({'keyframe.translation': 1e6, 'keyframe.rotation': 0.0})
-        samples = timed(1.0 + period * np.arange(len(poses)), poses)
-        assert not heard.hear(backend, samples) and not backend.news()
-        assert backend.robot().stamp == samples[-1].stamp

@@ -8,8 +8,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Strays among the odometry are dropped and counted, and robots that do odd things let pass."""
 
-from itertools import pairwise
-
 import heard
 import numpy as np
 import pytest
@@ -37,19 +35,19 @@ def among(place, *lates, poses=()):
 
 
 @pytest.mark.parametrize('samples, causes, errors, said', [
-    *((among(place, ahead - 0.05), {'stamp_ahead': 1}, 0,
+    *((among(place, ahead - 0.05), {'stamp_ahead': 1}, [],
        f'ns is {ahead + 0.05:.6g} s after the one before; expected the next one to go on')
       for place in (1, 2, 20) for ahead in (2.2, 59.0, PAUSE + 1, 3600.0, 1e9)),
-    (among(10, 1e6, 2e6, 1.5e6), {'stamp_ahead': 3}, 0, 'ns is 1e+06 s after the one'),
+    (among(10, 1e6, 2e6, 1.5e6), {'stamp_ahead': 3}, [], 'ns is 1e+06 s after the one'),
     # A node that runs on simulated time says the wall's until it has heard the clock.
-    (among(0, 1.7e9), {'stamp_ahead': 1}, 0, 'first odometry stamp 1700000001000000000 ns'),
-    (among(0, 2 * PAUSE), {'stamp_ahead': 1}, 0, 'expected one before that of the next'),
-    (among(10, 1e6, -0.5), {'stamp_ahead': 1}, 1, 'ns is 1e+06 s after the one before'),
-    (among(10, -0.6), {}, 1, ''),
-    (among(40, -3.0), {'old_stamp': 1}, 0, 'is not after the last one, 4900000000 ns'),
-    (among(40, -0.35, -0.2), {}, 2, ''),
+    (among(0, 1.7e9), {'stamp_ahead': 1}, [], 'first odometry stamp 1700000001000000000 ns'),
+    (among(0, 2 * PAUSE), {'stamp_ahead': 1}, [], 'expected one before that of the next'),
+    (among(10, 1e6, -0.5), {'stamp_ahead': 1}, ['0.4 s late'], 'ns is 1e+06 s after the one'),
+    (among(10, -0.6), {}, ['came 0.5 s late, and says where the robot did not go'], ''),
+    (among(40, -3.0), {'old_stamp': 1}, [], 'is not after the last one, 4900000000 ns'),
+    (among(40, -0.35, -0.2), {}, ['came 0.25 s late', 'came 0.1 s late'], ''),
     *((among(30, *(-0.05, -0.03)[:count], poses=[(x, y, 1.0), (2 * x, 2 * y, 1.0)][:count]),
-       {'jump': count}, 0, '.05 s later, at stamp 3950000000 ns; expected a motion that robots')
+       {'jump': count}, [], '.05 s later, at stamp 3950000000 ns; expected a motion that robots')
       for x, y in ((5e8, 0.0), (0.0, -3e5), (1.2 * FASTEST * heard.PERIOD, 0.0))
       for count in (1, 2))])
 def test_strays_are_dropped_and_counted(samples, causes, errors, said):
@@ -57,7 +55,8 @@ def test_strays_are_dropped_and_counted(samples, causes, errors, said):
     backend, refused = fed(samples)
     expected, _ = fed(GOOD)
     assert heard.refused(backend) == causes and not heard.told(backend)
-    assert len(refused) == errors and said in ''.join(backend.news())
+    assert said in ''.join(backend.news()) and len(refused) == len(errors)
+    assert all(error in one for error, one in zip(errors, refused, strict=True))
     now, then = backend.snapshot(), expected.snapshot()
     assert now.stamps.tolist() == then.stamps.tolist()
     assert_allclose(heard.steps_of(backend)[0], heard.steps_of(expected)[0], atol=1e-12)
@@ -92,32 +91,6 @@ def test_a_sample_far_ahead_is_used_once_the_next_one_goes_on_from_it():
         backend.add_odometry(ahead[0])
     assert backend.add_odometry(ahead[1]) and len(backend.poses) == 21
     assert not heard.refused(backend)
-
-
-@pytest.mark.parametrize('seed', range(6))
-def test_whatever_comes_each_sample_is_used_held_or_counted(seed):
-    """Stamps, poses and covariances of any size, also in a row and from the second message on."""
-    rng = np.random.default_rng(seed)
-    backend = heard.begun({**heard.EVERY, 'odometry.covariance_source': (
-        'model', 'increment', 'twist')[seed % 3]})
-    old = 0
-    for k in range(200):
-        time, pose, kind = 100.0 + k * heard.PERIOD, (0.1 * k, 0.0, 0.0), rng.integers(12)
-        time += {0: rng.uniform(-1, 1), 1: 10 ** rng.uniform(0.5, 9)}.get(kind, 0.0)
-        pose = {2: rng.normal(size=3) * 10 ** rng.uniform(0, 8), 3: (0, 0, 0)}.get(kind, pose)
-        covariance = np.diag(10 ** rng.uniform(-300, 300, 6))
-        old += len(heard.hear(backend, [
-            heard.odometry(time, pose, covariance, covariance),
-            heard.loop(time - 5.0, time, rng.normal(size=3), covariance)]))
-        now = backend.snapshot()  # with the loops that are due
-    refused = backend.counts().refused
-    assert refused.get('jump', 0) + heard.told(backend).get('new_part', 0) > 0
-    lost = sum(refused.get(cause, 0) for cause in ('stamp_ahead', 'jump', 'old_stamp'))
-    assert len(now.stamps) + lost + old in (199, 200)  # one may be held
-    for first, end in pairwise([0, *heard.parts(backend), len(now.stamps)]):
-        assert (np.diff(now.stamps[first:end]) > 0).all()
-    factors = now.graph.between
-    assert np.isfinite(factors.sqrt_information).all() and np.isfinite(factors.measurement).all()
 
 
 # Whose odometry it is
