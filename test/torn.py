@@ -8,14 +8,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A graph whose map is not to be relied on: refused loops of many places agree on another."""
 
-from dataclasses import replace
-
 import numpy as np
-from lies import careful_world
 
 from l1slam_ros.core.geometry import se2
 
-_SHIFT, _RUN = np.array([[8.0, -6.0, 0.4]]), 8
+_SHIFT = np.array([[8.0, -6.0, 0.4]])
 
 
 def shifted_runs(world, starts, length):
@@ -26,17 +23,3 @@ def shifted_runs(world, starts, length):
         graph.add_between(i + k, j + k, se2.between(world.truth[i + k], far),
                           np.tile(np.diag([400.0, 400.0, 1e4]), (length, 1, 1)))
     return graph
-
-
-def torn_graph():
-    """
-    Return a graph with 72 such loops, and where these end, (2,).
-
-    No true loop joins its halves.
-    """
-    starts, half = [(5 + 20 * run, 210 + 20 * run) for run in range(9)], 200
-    world = careful_world(400, 399 + 210)
-    factors = world.graph.between
-    within = factors.is_odometry | ((factors.i < half) == (factors.j < half))
-    graph = shifted_runs(replace(world, graph=world.graph.subset(within)), starts, _RUN)
-    return graph, np.array([starts[0][0], starts[-1][1] + _RUN])
