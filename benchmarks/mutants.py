@@ -176,9 +176,11 @@ def tests_of_lines(folder: Path, tree: Path) -> dict[str, dict[int, set[str]]]:
     import coverage
     data = coverage.CoverageData(str(folder / 'lines'))
     data.read()
-    runs = {str(Path(PACKAGE, file.rpartition(f'/{PACKAGE}/')[2])): {
-                line: {*tests} - {''} for line, tests in data.contexts_by_lineno(file).items()}
-            for file in data.measured_files()}
+    runs: dict[str, dict[int, set[str]]] = {}
+    for file in data.measured_files():  # also of an installed package
+        lines = runs.setdefault(str(Path(PACKAGE, file.rpartition(f'/{PACKAGE}/')[2])), {})
+        for line, tests in data.contexts_by_lineno(file).items():
+            lines.setdefault(line, set()).update({*tests} - {''})
     add_compiled(runs, {path.relative_to(tree).as_posix(): ast.parse(path.read_text())
                         for path in (tree / PACKAGE).rglob('*.py')})
     return runs
