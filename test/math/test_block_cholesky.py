@@ -17,10 +17,8 @@ from systems import (
     chain,
     cholesky_of_system,
     grid,
-    parallel,
     random_loops,
     random_system,
-    star,
 )
 
 from l1slam_ros.core.errors import FillError
@@ -100,17 +98,6 @@ def test_one_serves_blocks_of_every_size(rng):
         weights = rng.uniform(0.1, 3, len(system.b))
         assert cholesky.factorise(system, weights, 0.1)
         check_solution(cholesky, normal(system, weights, 0.1), rng)
-
-
-def test_a_factorisation_leaves_nothing_behind(rng):
-    """Also not one that failed."""
-    system = random_system(3 * grid(N), N, 3, rng)
-    ones, cholesky = np.ones(len(system.b)), cholesky_of_system(system)
-    assert cholesky.factorise(system, 5 * ones)
-    assert not cholesky.factorise(system, ones, -1e3)
-    assert cholesky.factorise(system, ones)
-    check_solution(cholesky, normal(system, ones), rng)
-
 
 
 # What may be added to the matrix
@@ -197,47 +184,9 @@ def test_what_is_not_finite_is_refused(value, rng):
         assert not cholesky.factorise(system, weights)
 
 
-def test_units_do_not_matter(rng):
-    """Steps in nanometres and in gigaradians: a scaled diagonal is no singularity."""
-    system = random_system(3 * grid(N), N, 3, rng)
-    scale = np.array([1e-8, 1.0, 1e8])
-    blocks = system.blocks * scale
-    scaled = type(system)(system.keyframe, blocks, system.b, N)
-    cholesky, ones = cholesky_of_system(system), np.ones(len(system.b))
-    right = rng.standard_normal(3 * N)
-    assert cholesky.factorise(system, ones)
-    expected = cholesky.solve(right) / np.tile(scale, N)
-    assert cholesky.factorise(scaled, ones)
-    assert_allclose(cholesky.solve(right * np.tile(scale, N)), expected, rtol=1e-9)
-
-
 # The pattern
 
 
-# The fill
-
-
-def filled(pairs, n, position):
-    """Return the lower triangle (n, n) bool of the factor in an order, by dense elimination."""
-    matrix = np.eye(n, dtype=bool)
-    for i, j in pairs:
-        if max(i, j) < n:
-            matrix[position[i], position[j]] = matrix[position[j], position[i]] = True
-    for k in range(n):
-        below = k + 1 + np.flatnonzero(matrix[k + 1:, k])
-        matrix[np.ix_(below, below)] = True
-    return np.tril(matrix)
-
-
-@pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)
-def test_the_work_is_that_of_dense_elimination(shape):
-    """Half of the square of each column; chains and stars do not fill in."""
-    pattern = find_pattern(np.array(shape(N)), N, PLENTY)
-    factor = filled(shape(N), N, pattern.position)
-    assert_array_equal(np.sort(pattern.position), np.arange(N))
-    assert pattern.work == (factor.sum(axis=0).astype(float) ** 2).sum() / 2
-    if shape in (chain, star, parallel):
-        assert factor.sum() == N + N - 1
 
 
 def test_too_much_fill_is_refused():

@@ -19,7 +19,6 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.l1_problem import LinearProblem
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.kernels import interior_point as kernels
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point, prove
 from l1slam_ros.core.solvers.interior_point import interior_point
@@ -183,51 +182,3 @@ def test_where_there_is_no_direction_it_stalls_at_its_start(rng):
     assert optimum.status == 'stalled' and not optimum.poses.any() and len(optimum.costs) == 1
 
 
-# The compiled row-wise work
-
-
-@pytest.fixture
-def rows(rng):
-    """Return e, (u, v, s, t), y, q, c1, c2 of a point inside its bounds."""
-    e, c1, c2 = rng.standard_normal((3, 50))
-    u, v = rng.uniform(0.1, 2, (2, 50))
-    y = rng.uniform(-0.9, 0.9, 50)
-    s, t = 1 - y, 1 + y
-    return e, (u, v, s, t), y, 1 / (u / s + v / t), c1, c2
-
-
-@pytest.mark.parametrize('size', [1e-3, 1.0, 1e12])
-def test_a_run_begins_on_the_central_path(size, rng):
-    e = np.append(size * rng.standard_normal(50), 0.0)
-    u, v, s, t, y = kernels.begin(e, 0.3)
-    assert_allclose(u - v, e, atol=1e-15)
-    assert_allclose((u * s, v * t), np.full((2, 51), 0.3))
-    assert_allclose((s, t), (1 - y, 1 + y), atol=1e-15)
-    assert min(u.min(), v.min(), s.min(), t.min()) > 0
-
-
-def test_the_step_solves_the_newton_equations(rows, rng):
-    """u s = c1 and v t = c2 to first order, e + J dx = u - v, and bounds met as said."""
-    e, (u, v, s, t), y, q, c1, c2 = rows
-    moved = rng.standard_normal(50)
-    g = e - (u - v) - (c1 / s - u) + (c2 / t - v)
-    state = (u, v, s, t, q, e, y)
-    assert_allclose(kernels.aim(*state, c1, c2), -(y + q * g))
-    dy, primal, dual, _ = kernels.complete(*state, c1, c2, moved, 1.0)
-    assert_allclose(dy, q * (moved + g))
-    du, dv = (c1 + u * dy) / s - u, (c2 - v * dy) / t - v
-    assert_allclose(u * s + s * du - u * dy, c1)
-    assert_allclose(v * t + t * dv + v * dy, c2)
-    assert_allclose((u + du) - (v + dv), e + moved, atol=1e-12)
-    # At these lengths the first bound is met, and none is passed.
-    assert primal < 1 and dual < 1
-    assert min((u + primal * du).min(), (v + primal * dv).min()) == pytest.approx(0, abs=1e-12)
-    assert min((s - dual * dy).min(), (t + dual * dy).min()) == pytest.approx(0, abs=1e-12)
-    _, part_primal, part_dual, gap = kernels.complete(*state, c1, c2, moved, 0.9)
-    primal, dual = 0.9 * primal, 0.9 * dual
-    assert (part_primal, part_dual) == pytest.approx((primal, dual))
-    assert gap == pytest.approx((u + primal * du) @ (s - dual * dy)
-                                + (v + primal * dv) @ (t + dual * dy))
-    # Small steps meet no bound: they are taken whole.
-    fits = (u, v, s, t, q, u - v + 1e-3 * g, y)
-    assert kernels.complete(*fits, u * s, v * t, 1e-3 * moved, 0.9)[1:3] == (1, 1)

@@ -20,7 +20,6 @@ from l1slam_ros.core.graph.linear_system import linearise, step_poses, whitened_
 from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import Huber, l2_cost
-from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions, minimise_l1
 from l1slam_ros.core.solvers.solve import choose, minimise_by, norm_for
 
 DELTA = 1.345
@@ -246,14 +245,3 @@ def test_a_smoothed_norm_is_differentiated(names, promising, rng):
     assert np.linalg.eigvalsh(W - H).min() > -1e-6
     if 'huber' not in names:
         assert_allclose(W, H, atol=1e-5)
-
-
-@pytest.mark.parametrize('names', PURE + MIXED)
-def test_the_primal_dual_method_takes_any_norm(names, rng):
-    graph, truth = noisy_graph(8, 6, rng)
-    system, norm = linearise(graph, truth), norm_for(graph, *names, DELTA)
-    found = minimise_l1(system.A, system.b, np.zeros(21), np.zeros(len(system.b)),
-                        PrimalDualOptions(20000, 1e-6), norm=norm)
-    other = minimize(lambda x: norm.cost(system.A @ x - system.b), found.x, method='Powell',
-                     options={'xtol': 1e-10, 'ftol': 1e-12})
-    assert found.objective <= other.fun * (1 + 1e-4) and found.gap < 1e-3 * found.objective

@@ -176,14 +176,3 @@ def test_neither_the_size_of_all_noise_nor_the_unit_of_length_matters(factor, rn
     other = minimise_l1(factor * A, b, *zeros(A), options)
     assert other.objective == pytest.approx(one.objective, rel=1e-3)
     assert_allclose(factor * other.x, one.x, atol=0.05 * np.abs(one.x).max())
-
-
-def test_a_warm_start_needs_fewer_iterations(rng):
-    A, b = random_system('sparse', rng)
-    options = PrimalDualOptions(100_000, 1e-3)
-    cold = minimise_l1(A, b, *zeros(A), options)
-    moved = b + 1e-4 * rng.standard_normal(len(b))
-    again, warm = (minimise_l1(A, moved, *start, options)
-                   for start in (zeros(A), (cold.x, cold.y)))
-    assert warm.status == again.status == 'converged'
-    assert warm.iterations < again.iterations / 2
