@@ -171,14 +171,3 @@ def test_what_rounding_leaves_indefinite_is_solved_to_its_end():
     graphs = [stiff_part_on_soft_ties(np.random.default_rng(seed)) for seed in range(5)]
     found = [solve_exactly(graph, odometry_poses(graph)) for graph in graphs]
     assert np.median([one.gap / one.cost for one in found]) < 1e-3
-
-
-def test_where_there_is_no_direction_it_stalls_at_its_start(rng):
-    """A number that is not finite: nothing can be factored."""
-    system = random_system(2 * SHAPES[0](12), 12, 3, rng)
-    system.blocks[7] = np.nan
-    optimum = interior_point(LinearProblem(system), np.zeros(36), cholesky_of_system(system), 60,
-                             1e-8)
-    assert optimum.status == 'stalled' and not optimum.poses.any() and len(optimum.costs) == 1
-
-

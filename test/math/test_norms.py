@@ -224,24 +224,3 @@ def test_the_promises_of_a_norm(names, promising, rng):
     # y = (I + sigma dF*)^-1 (y + sigma r) where r is in dF*(y), which y = dF(r) says.
     assert_allclose(norm.resolvent(y + 0.7 * r, 0.7), y, atol=1e-5)
     assert (norm.weights(r) > 0).all()
-
-
-@pytest.mark.parametrize('names', PURE + MIXED)
-def test_a_smoothed_norm_is_differentiated(names, promising, rng):
-    """Its gradient by differences; and its curvature at the dual that is the gradient, for Huber
-    reweighted, which is no less."""
-    norm, e = norm_for(promising, *names, DELTA), 2 * rng.standard_normal((20, 3))
-    mu, h = 0.3, 1e-5
-    y = norm.smoothed(e, np.zeros((20, 3)), mu).gradient
-    cost, d, W = norm.smoothed(e, y, mu)
-    assert cost >= norm.cost(e.ravel())
-    axes = h * np.eye(60).reshape(60, 20, 3)
-    ahead, behind = ([norm.smoothed(e + sign * axis, y, mu) for axis in axes] for sign in (1, -1))
-    assert_allclose(d.ravel(), [(a.cost - b.cost) / (2 * h) for a, b in zip(
-        ahead, behind, strict=True)], atol=1e-6)
-    H = np.array([(a.gradient - b.gradient).ravel() / (2 * h) for a, b in zip(
-        ahead, behind, strict=True)])
-    W = sum(np.kron(np.diag(row), W[f]) for f, row in enumerate(np.eye(20)))
-    assert np.linalg.eigvalsh(W - H).min() > -1e-6
-    if 'huber' not in names:
-        assert_allclose(W, H, atol=1e-5)

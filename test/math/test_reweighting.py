@@ -76,13 +76,6 @@ def test_a_warm_step_by_hand():
     assert_allclose(warm_step(system, cholesky, np.zeros(3), 0.0), [16 / 11 - 2])
 
 
-def test_a_part_that_is_not_tied_to_the_anchor_is_named():
-    A = csr_array(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, -1.0]]))
-    system = system_of(A, np.ones(3))
-    with pytest.raises(GraphError, match='not tied to the anchor'):
-        weighted_least_squares(system, cholesky_of_system(system), np.ones(3))
-
-
 @pytest.mark.parametrize('kind', KINDS)
 def test_the_start_is_within_two_percent_of_the_optimum(kind, rng):
     for _ in range(10):

@@ -92,14 +92,6 @@ def test_a_few_gross_loops_do_not_bend_the_headings(rng):
     assert np.abs(se2.local(poses, truth)[:, 2]).max() < 0.05
 
 
-def test_it_needs_no_odometry(rng):
-    """Keyframes seen from one hub alone, and from each other."""
-    truth = drive(20, rng)
-    pairs = [(7, k) for k in range(20) if k != 7] + [(k, k + 5) for k in range(10, 15)]
-    poses = seed_of(graph_of(truth, pairs, 0.01 * rng.standard_normal((len(pairs), 3))))
-    assert np.abs(se2.local(poses, truth)[:, 2]).max() < 0.1
-
-
 @pytest.mark.parametrize('manifold', [se2, se3], ids=lambda manifold: manifold.NAME)
 @pytest.mark.parametrize('absolute', [False, True])
 def test_the_chordal_relaxation_is_exact_without_noise(manifold, absolute, rng):
