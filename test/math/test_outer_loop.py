@@ -12,8 +12,8 @@ import time
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-from problems import chain_and_loops, drive, graph_of, linprog_l1, noisy_graph
+from numpy.testing import assert_array_equal
+from problems import linprog_l1, noisy_graph
 
 import l1slam_ros as l1
 from l1slam_ros.core.geometry import se2
@@ -101,19 +101,6 @@ def test_a_deadline_that_has_passed_leaves_one_linearisation(world):
     found = solve(graph, start, deadline=time.monotonic())
     assert (found.status, found.outer_iterations) == ('out_of_time', 1)
     assert found.cost < cost(graph, start)
-
-
-def test_graphs_that_fit_to_rounding_are_solved(rng):
-    """Also chains of one step, from anywhere."""
-    truth = drive(30, rng)
-    graph = graph_of(truth, chain_and_loops(30, 20, rng))
-    found = solve(graph, se2.retract(truth, 1e-9 * rng.standard_normal((30, 3))))
-    assert_allclose(se2.between(found.poses[:1], found.poses), se2.between(truth[:1], truth),
-                    atol=1e-8)
-    for _ in range(60):
-        truth = drive(2, rng)
-        found = solve(graph_of(truth, [(0, 1)]), se2.identity(2))
-        assert_allclose(found.poses, truth, atol=1e-9)
 
 
 def test_a_dual_kept_from_step_to_step_leads_further(world):
