@@ -16,9 +16,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from problems import HAND_SOLVED, RANDOM_SYSTEMS, linprog_l1, random_system
 from scipy.sparse import csr_array
 
-from l1slam_ros.core.solvers.optimality import Status, duality_gap, l1_cost
+from l1slam_ros.core.solvers.optimality import duality_gap, l1_cost
 from l1slam_ros.core.solvers.primal_dual import (
-    CHECK_EVERY,
     PrimalDualOptions,
     diagonal_step_sizes,
     minimise_l1,
@@ -85,10 +84,32 @@ def test_the_primal_weight_by_hand():
     A = csr_array(np.array([[2.0, 1.0], [0.0, -4.0], [0.0, 0.0]]))
     weight = primal_weight(A, np.array([-5.0, 12.0, 5.0]), np.array([1.0, -1.0]))
     assert weight == pytest.approx(1 / ((3 + 2 + 0) / 3))
-
-
-def test_the_primal_weight_of_an_exact_fit_is_finite():
     assert np.isfinite(primal_weight(csr_array(np.eye(2)), np.ones(2), np.ones(2)))
+
+
+# What is minimised, and the proof
+
+
+@pytest.mark.parametrize('make', HAND_SOLVED, ids=lambda make: make.__name__)
+def test_the_gap_is_zero_at_the_optimum_and_only_there(make):
+    problem = make()
+    box = np.full(len(problem.x), 100.0)
+    gap = duality_gap(problem.A, problem.b, problem.x, problem.y, box)
+    assert gap == pytest.approx(0, abs=1e-12)
+    assert l1_cost(problem.A @ problem.x - problem.b) == pytest.approx(problem.optimum)
+    for x in problem.x + 0.1, problem.x - 0.1:
+        assert duality_gap(problem.A, problem.b, x, problem.y, box) > 1e-3
+
+
+@pytest.mark.parametrize('kind', RANDOM_SYSTEMS)
+def test_the_gap_bounds_the_distance_to_the_best_in_the_box(kind, rng):
+    """For any x and any y in the unit box, feasible or not."""
+    for _ in range(10):
+        A, b = random_system(kind, rng)
+        x, y = rng.standard_normal(A.shape[1]), rng.uniform(-1, 1, len(b))
+        box = rng.uniform(0, 3, len(x))
+        above = l1_cost(A @ x - b) - linprog_l1(A, b, box)[0]
+        assert duality_gap(A, b, x, y, box) >= above - 1e-9
 
 
 # Algorithm 2
@@ -109,7 +130,7 @@ def test_algorithm_2_solves_what_was_solved_by_hand(make):
 @pytest.mark.parametrize('kind, within', [
     ('dense', 1e-3), ('sparse', 1e-3), ('empty row and column', 1e-3), ('scaled rows', 1e-2)])
 def test_algorithm_2_agrees_with_highs(kind, within, rng):
-    for _ in range(8):
+    for _ in range(3):
         A, b = random_system(kind, rng)
         solution = minimise_l1(A, b, *zeros(A), LONG)
         best, _ = linprog_l1(A, b)
@@ -118,49 +139,12 @@ def test_algorithm_2_agrees_with_highs(kind, within, rng):
 
 
 @pytest.mark.parametrize('kind', RANDOM_SYSTEMS)
-def test_the_gap_bounds_the_error_within_the_box(kind, rng):
-    """Early and late: objective - gap is never above the best that |x_j| <= box_j allows."""
+def test_converged_means_that_the_gap_is_below_the_tolerance(kind, rng):
+    """The gap is for steps as long as x; an empty row does not keep it open."""
     A, b = random_system(kind, rng)
-    for iterations in (1, 40, 400, 4000):
-        options = PrimalDualOptions(iterations=iterations, tolerance=0.0)
-        solution = minimise_l1(A, b, *zeros(A), options)
-        best, _ = linprog_l1(A, b, np.abs(solution.x))
-        assert solution.objective - solution.gap <= best + 1e-9
-        assert solution.gap == duality_gap(A, b, solution.x, solution.y, np.abs(solution.x))
-
-
-def test_converged_means_that_the_gap_is_below_the_tolerance(rng):
-    A, b = random_system('dense', rng)
-    options = PrimalDualOptions(iterations=100_000, tolerance=1e-2)
-    solution = minimise_l1(A, b, *zeros(A), options)
-    assert solution.status is Status.CONVERGED
+    solution = minimise_l1(A, b, *zeros(A), PrimalDualOptions(100_000, 1e-2))
+    assert solution.status == 'converged' and solution.iterations < 100_000
+    assert solution.gap == duality_gap(A, b, solution.x, solution.y, np.abs(solution.x))
     assert solution.gap <= 1e-2 * solution.objective
-    assert solution.iterations % CHECK_EVERY == 0 and solution.iterations < 100_000
-    assert solution.objective <= linprog_l1(A, b, np.abs(solution.x))[0] / (1 - 1e-2)
-
-
-def test_an_empty_row_does_not_keep_the_gap_open():
-    A, b = csr_array(np.array([[1.0], [0.0], [2.0]])), np.array([1.0, 3.0, 2.0])
-    solution = minimise_l1(A, b, *zeros(A), LONG)
-    assert solution.objective == pytest.approx(3.0)
-    assert solution.status is Status.CONVERGED
-
-
-def test_a_start_at_the_optimum_stays_there():
-    for make in HAND_SOLVED:
-        problem = make()
-        solution = minimise_l1(problem.A, problem.b, problem.x, problem.y, LONG)
-        assert solution.iterations == CHECK_EVERY or problem.optimum == 0
-        assert_allclose(solution.x, problem.x, atol=1e-9)
-        assert_allclose(solution.y, problem.y, atol=1e-9)
-
-
-@pytest.mark.parametrize('factor', [1000.0, 1e-6])
-def test_the_size_of_all_noise_does_not_matter(factor, rng):
-    """All rows in another unit, A and b alike."""
-    A, b = random_system('dense', rng)
-    options = PrimalDualOptions(iterations=4000, tolerance=1e-3)
-    one = minimise_l1(A, b, *zeros(A), options)
-    other = minimise_l1(factor * A, factor * b, *zeros(A), options)
-    assert other.iterations == one.iterations
-    assert_allclose(other.x, one.x, rtol=1e-6, atol=1e-9)
+    early = minimise_l1(A, b, *zeros(A), PrimalDualOptions(41, 0.0))
+    assert early.status == 'iteration_limit' and early.iterations == 41
