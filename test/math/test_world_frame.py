@@ -11,7 +11,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import add_absolute, drive, graph_of
+from problems import add_absolute, chain_of, drive, graph_of
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.world_frame import placed
@@ -29,14 +29,14 @@ def moved(poses, motion):
     ([4], WHOLE), ([4, 9], POSITION), ([1, 5, 9], POSITION), ([0, 3, 9], WHOLE)])
 def test_a_chain_comes_to_its_place(k, information, rng):
     truth, k = drive(10, rng), np.array(k)
-    graph = graph_of(truth, [(i, i + 1) for i in range(9)])
+    graph = graph_of(truth, chain_of(10))
     add_absolute(graph, k, truth[k], np.tile(information, (len(k), 1, 1)))
     assert_allclose(placed(graph, moved(truth, (30.0, -7.0, 2.0))), truth, atol=1e-9)
 
 
 def test_what_nothing_says_stays(rng):
     truth = drive(10, rng)
-    graph = graph_of(truth, [(i, i + 1) for i in range(9)])
+    graph = graph_of(truth, chain_of(10))
     assert placed(graph, truth) is truth
     add_absolute(graph, np.array([4]), np.array([[5.0, 6, 1]]), HEADING[None])
     turned = placed(graph, truth)
@@ -47,7 +47,7 @@ def test_what_nothing_says_stays(rng):
 
 def test_a_few_false_ones_do_not_matter(rng):
     truth, k = drive(40, rng), np.arange(0, 40, 4)
-    graph = graph_of(truth, [(i, i + 1) for i in range(39)])
+    graph = graph_of(truth, chain_of(40))
     measured = truth[k]
     measured[[1, 4, 8], :2] += 100 * rng.standard_normal((3, 2))
     add_absolute(graph, k, measured, np.tile(POSITION, (10, 1, 1)))
@@ -56,7 +56,7 @@ def test_a_few_false_ones_do_not_matter(rng):
 
 def test_each_part_by_itself(rng):
     truth, k = drive(12, rng), np.array([0, 3, 6, 9])
-    graph = graph_of(truth, [(i, i + 1) for i in range(11) if i not in (4, 9)])
+    graph = graph_of(truth, np.delete(chain_of(12), [4, 9], axis=0))
     add_absolute(graph, k, truth[k], np.tile(POSITION, (4, 1, 1)))
     poses = np.concatenate([moved(truth[part], motion) for part, motion in (
         (slice(0, 5), (3.0, 4, 1)), (slice(5, 10), (-9.0, 2, 3)), (slice(10, 12), (1.0, 1, 1)))])
