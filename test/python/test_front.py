@@ -1,0 +1,179 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""The map between two solves: `Backend.update` while no background work helps it."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems import EVERY, PERIOD, covariance6, hear, messages, odometry, seconds
+from worlds import false_of, made, whitened
+
+import l1slam_ros as l1
+
+CREDULOUS = l1.BackendOptions.from_mapping({
+    'keyframe': {'translation': 0.0, 'rotation': 0.0},
+    'odometry': {'covariance_source': 'increment'}, 'robust': {'enabled': False}})
+N, KNOWN = 180, 140
+ACCEPTED = 2  # of waiting, suspect, accepted, rejected, expired
+COVARIANCE = np.diag([4e-4, 1e-4, 2e-4, 1e-5, 3e-5, 2e-5])
+
+
+def rows_of(graph, poses):
+    """Return the whitened Jacobian of all factors by steps of all keyframes, (m, d, n, d)."""
+    factors, manifold = graph.between, graph.manifold
+    ends = np.concatenate((poses, manifold.identity(1)))  # the last one is the world
+    J = manifold.residual_jacobians(factors.measurement, ends[factors.i], ends[factors.j])
+    J = factors.sqrt_information[:, None] @ J
+    whole = np.zeros((*J.shape[::2], len(ends), J.shape[3]))
+    for k, (i, j) in enumerate(zip(factors.i, factors.j, strict=True)):
+        whole[k, :, i], whole[k, :, j] = J[k]
+    return whole[:, :, :-1]
+
+
+def covariance_of_all(graph, poses):
+    """Return the covariance of all keyframes, by a dense inverse, (n, d, n, d)."""
+    fixed = 0 if graph.between.is_absolute.any() else 1
+    A = rows_of(graph, poses)[:, :, fixed:]
+    n, d = A.shape[2:]
+    A = A.reshape(-1, n * d)
+    whole = np.zeros((n + fixed, d, n + fixed, d))
+    whole[fixed:, :, fixed:] = np.linalg.inv(A.T @ A).reshape(n, d, n, d)
+    return whole
+
+
+@pytest.mark.parametrize('absolute', [False, True], ids=['from the first', 'in the world'])
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_how_sure_the_map_is_of_a_keyframe(dimension, absolute):
+    """Without noise all maps are the truth, where the covariance is a dense inverse."""
+    backend = l1.Backend(CREDULOUS, dimension)
+    manifold, n, loops = backend.manifold, 40, [(2, 17), (5, 30), (9, 34), (31, 38)]
+    assert backend.marginal_covariance(0) is None
+    step = manifold.from_pose3(np.array([[0.5, 0.1, 0.05, 0.02, -0.03, 0.2, 0.97]]))
+    truth = manifold.identity(1)
+    for _ in range(n - 1):
+        truth = np.concatenate((truth, manifold.compose(truth[-1:], step)))
+
+    def add(first, last):
+        for k in range(first, last):
+            backend.add_odometry(l1.OdometrySample(
+                seconds(k), manifold.to_pose3(truth[k:k + 1])[0], COVARIANCE, 0 * COVARIANCE))
+            for i in [i for i, j in loops if j == k]:
+                seen = manifold.to_pose3(manifold.between(truth[i:i + 1], truth[k:k + 1]))
+                backend.add_loop(l1.LoopClosure(seconds(i), seconds(k), seen[0], COVARIANCE / 9))
+            if absolute and k % 8 == 0:
+                backend.add_loop(l1.LoopClosure(
+                    None, seconds(k), manifold.to_pose3(truth[k:k + 1])[0], COVARIANCE))
+
+    def compare(count):
+        now = backend.snapshot().graph
+        assert now.n_poses == count
+        assert_allclose(manifold.local(truth[:count], backend.poses), 0, atol=1e-5)
+        whole = covariance_of_all(now, truth[:count])
+        for k in (0, 1, 20, count - 1):
+            assert_allclose(backend.marginal_covariance(k), whole[k, :, k], rtol=1e-6, atol=1e-12)
+        i, j = 3, count - 1
+        ends = truth[i:i + 1], truth[j:j + 1]
+        J = np.hstack(manifold.residual_jacobians(manifold.between(*ends), *ends)[0])
+        both = whole[[i, j]][:, :, [i, j]].reshape(J.shape[1], J.shape[1])
+        assert_allclose(backend.marginal_covariance(j, i), J @ both @ J.T, rtol=1e-6, atol=1e-12)
+        assert backend.marginal_covariance(count) is None
+
+    add(0, 33)
+    backend.settle()
+    compare(33)
+    with backend.calm:
+        for k in range(33, n):
+            add(k, k + 1)
+            backend.update(0.0)
+        compare(n)
+
+
+def test_of_a_part_that_nothing_joins_hardly_anything_is_known():
+    backend = l1.Backend(EVERY)
+
+    def drive(first, count):
+        for k in range(count):
+            backend.add_odometry(odometry(first + k, (k, 0.0, 0.0), covariance6(1e-4 * np.eye(3))))
+        backend.settle()
+        return backend.marginal_covariance(len(backend.poses) - 1)
+
+    known, unknown = drive(100.0, 10), drive(50.0, 3)
+    assert 0 < known[0, 0] < 0.1 and unknown[0, 0] > 50 and unknown[2, 2] > 0.9
+    # Where the clock is set back between two solves, a part of its own begins.
+    with backend.calm:
+        for k in range(4):
+            backend.add_odometry(odometry(1.0 + k, (k, 0.0, 0.0), covariance6(1e-4 * np.eye(3))))
+        assert backend.update(0.0) is not None
+        assert len(backend.poses) == 17 and np.isfinite(backend.poses).all()
+
+
+@pytest.fixture(scope='module')
+def world(tmp_path_factory):
+    return made(tmp_path_factory.mktemp('world') / 'world.g2o', N, 2 * N)
+
+
+def settled(graph):
+    """Return a back end with a settled map of the first keyframes."""
+    backend = l1.Backend(EVERY)
+    hear(backend, messages(graph, 0, KNOWN))
+    backend.settle()
+    return backend
+
+
+def drive_on(backend, graph, last=N):
+    """Add the other keyframes one by one, with an update each."""
+    for k in range(KNOWN, last):
+        hear(backend, messages(graph, k, k + 1))
+        backend.update(0.0)
+
+
+def test_the_map_stays_near_the_optimum_and_a_bound_of_it_stays_true(world):
+    graph, _ = l1.read_graph(world)
+    assert np.isnan(l1.Backend(EVERY).behind().bound)
+    backend = settled(graph)
+    proved = backend.behind()
+    assert proved.rows == 0
+    with backend.calm:
+        drive_on(backend, graph, KNOWN + 10)
+        now, states, behind = backend.snapshot().graph, backend.loop_states(), backend.behind()
+        assert (states.state == ACCEPTED).mean() > 0.98
+        used = now.subset(now.between.is_odometry)
+        rows = states.rows[states.state[:len(states.rows)] == ACCEPTED]
+        used.add_between(*(getattr(now.between, name)[rows] for name in (
+            'i', 'j', 'measurement')), np.einsum(
+                'nki,nkj->nij', *2 * [now.between.sqrt_information[rows]]))
+        best = l1.solve(used, robust=False).cost
+        assert np.abs(whitened(used, backend.poses)).sum() < 1.1 * best
+        # With ten keyframes more the optimum has risen, by little.
+        assert behind.bound == proved.bound and behind.bound_age > proved.bound_age
+        assert 0.8 * best < behind.bound <= best
+        assert behind.rows > 0 and behind.loops > 0
+        # Of fewer factors nothing was proved.
+        reference, stamp = states.stamps[np.argmax(states.state == ACCEPTED)].tolist()
+        backend.add_loop(l1.LoopClosure(reference, stamp, np.eye(7)[6], np.eye(6), struck=True))
+        backend.update(0.0)
+        assert np.isnan(backend.behind().bound)
+
+
+@pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])
+def test_the_gate_lets_no_lie_in(tmp_path, kind):
+    path = made(tmp_path / 'lies.g2o', N, 2 * N, '--false-loops', 130, '--kind', kind)
+    graph, _ = l1.read_graph(path)
+    false = {tuple(sorted(pair)) for pair in false_of(path)}
+    backend = settled(graph)
+    known = len(backend.loop_states().state)
+    with backend.calm:
+        drive_on(backend, graph)
+        states = backend.loop_states()
+    pairs = np.round(states.stamps / seconds(PERIOD)).astype(int).tolist()
+    lies = np.array([tuple(pair) in false for pair in pairs])
+    new, accepted = np.arange(len(lies)) >= known, states.state == ACCEPTED
+    assert np.count_nonzero(lies & new) > 5 and not (lies & accepted).any()
+    # The others wait for the judgement.
+    assert accepted[new & ~lies].mean() > 0.7
