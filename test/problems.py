@@ -14,17 +14,16 @@ from itertools import islice
 import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
+from worlds import between, compose
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.graph.recording import recorded
-from l1slam_ros.core.online.graph_builder import GraphBuilder
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.running.backend import BackendOptions
+import l1slam_ros as l1
 
 # Every message a keyframe, with the covariance it states: the graph is that of the messages.
-EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
+EVERY = l1.BackendOptions.from_mapping({
+    'keyframe': {'translation': 0.0, 'rotation': 0.0, 'period': 0.0},
+    'odometry': {'covariance_source': 'increment'}})
+PLANE = l1.Backend().manifold
+WORLD = -1  # as an end of a factor
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def drive(n, rng):
     poses = np.zeros((n, 3))
     for k in range(1, n):
         step = np.array([[1.0, 0.0, 0.0]]) + [0.2, 0.1, 0.6] * rng.standard_normal((1, 3))
-        poses[k] = se2.compose(poses[k - 1 : k], step)[0]
+        poses[k] = compose(poses[k - 1 : k], step)[0]
     return poses
 
 
@@ -153,7 +152,7 @@ def chain_of(n):
 
 def graph_of(truth, pairs, noise=0.0, information=USUAL):
     """Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3)."""
-    graph = FactorGraph(se2, len(truth))
+    graph = l1.FactorGraph(PLANE, len(truth))
     measure(graph, truth, *np.array(pairs).T, noise, information)
     return graph
 
@@ -164,15 +163,14 @@ def measure(graph, truth, i, j, noise=0.0, information=USUAL):
 
     noise : (m, 3) steps applied to the measurements; information : (m, 3, 3); or one for all
     """
-    exact = se2.between(truth[i], truth[j])
-    graph.add_between(i, j, se2.retract(exact, np.broadcast_to(noise, exact.shape)),
+    exact = between(truth[i], truth[j])
+    graph.add_between(i, j, PLANE.retract(exact, np.broadcast_to(noise, exact.shape)),
                       np.broadcast_to(information, (*exact.shape, 3)))
 
 
 def retold(graph, measurement=None, times=1.0, trusted=None):
     """Return the graph with other measurements (m, p), sigmas that many times (m,), trust (m,)."""
-    factors, other = graph.between, FactorGraph(graph.manifold)
-    other.add_poses(graph.n_poses)
+    factors, other = graph.between, l1.FactorGraph(graph.manifold, graph.n_poses)
     other.append_between(factors.i, factors.j,
                          factors.measurement if measurement is None else measurement,
                          factors.sqrt_information / np.reshape(times, (-1, 1, 1)),
@@ -217,14 +215,14 @@ UNKNOWN = np.zeros((6, 6))
 
 def odometry(time, pose, covariance=UNKNOWN, twist_covariance=UNKNOWN):
     """Return the sample of a robot at `pose` (3,), `time` in seconds."""
-    return OdometrySample(seconds(time), se2.to_pose3(np.array(pose, float)), covariance,
-                          twist_covariance)
+    return l1.OdometrySample(seconds(time), PLANE.to_pose3(np.array(pose, float)), covariance,
+                             twist_covariance)
 
 
 def loop(reference_time, time, pose, covariance=UNKNOWN):
     """Return the loop that saw the robot at `pose` (3,), times in seconds."""
-    return LoopClosure(seconds(reference_time), seconds(time), se2.to_pose3(np.array(pose, float)),
-                       covariance)
+    return l1.LoopClosure(seconds(reference_time), seconds(time),
+                          PLANE.to_pose3(np.array(pose, float)), covariance)
 
 
 PERIOD = 0.1  # [s] from one sample to the next
@@ -235,19 +233,21 @@ def curve(n):
     poses = np.zeros((n, 3))
     for k in range(1, n):
         step = np.array([[0.12, 0.01, 0.03 + 0.02 * np.sin(k / 5)]])
-        poses[k] = se2.compose(poses[k - 1 : k], step)[0]
+        poses[k] = compose(poses[k - 1 : k], step)[0]
     return poses
 
 
 def true_loop(poses, reference, sample, covariance=UNKNOWN):
     """Return what sees sample from reference without noise."""
-    pose = se2.between(poses[reference : reference + 1], poses[sample : sample + 1])[0]
+    pose = between(poses[reference : reference + 1], poses[sample : sample + 1])[0]
     return loop(reference * PERIOD, sample * PERIOD, pose, covariance)
 
 
 def grown(poses, options, covariance=UNKNOWN):
     """Return the builder after the samples of `poses` (n, 3), one every .1 s from 0."""
-    builder = GraphBuilder(se2, options)
+    from l1slam_ros.core.online.graph_builder import GraphBuilder
+
+    builder = GraphBuilder(PLANE, options)
     drive_on(builder, poses, covariance=covariance)
     return builder
 
@@ -287,16 +287,34 @@ def messages(graph, first=0, last=None, start=0.0):
 
     Of keyframes first to last of the graph; number k is at `start` [s] + k `PERIOD`.
     """
+    factors, manifold = graph.between, graph.manifold
     stamps = [seconds(start + k * PERIOD) for k in range(graph.n_poses)]
-    for sample, loops in islice(recorded(graph, stamps), first, last):
-        yield sample
-        yield from loops
+    pose, measured = manifold.identity(graph.n_poses), manifold.to_pose3(factors.measurement)
+    covariances, said = np.zeros((len(factors), 6, 6)), factors.speaks
+    for k, root in enumerate(factors.sqrt_information):
+        rows = np.array(manifold.COVARIANCE_ROWS)
+        own, silent = rows[said[k]], rows[~said[k]]
+        root = root[np.ix_(said[k], said[k])]
+        covariances[k][np.ix_(own, own)] = np.linalg.inv(root.T @ root)
+        covariances[k, silent, silent] = np.inf
+    for k in np.flatnonzero(factors.step_to >= 0).tolist():
+        before, step = graph.parent[k], factors.measurement[factors.step_to[k]]
+        pose[k] = manifold.compose(pose[before:before + 1], step[None])[0]
+    poses, loops = manifold.to_pose3(pose), ~factors.is_odometry
+    for k in islice(range(graph.n_poses), first, last):
+        step = factors.step_to[k]
+        yield l1.OdometrySample(stamps[k], poses[k], UNKNOWN if step < 0 else covariances[step],
+                                UNKNOWN)
+        for row in np.flatnonzero(loops & (factors.j == k)):
+            i = factors.i[row]
+            yield l1.LoopClosure(None if i == WORLD else stamps[i], stamps[k], measured[row],
+                                 covariances[row], bool(factors.trusted[row]))
 
 
 def hear(backend, found):
     """Add samples and loops."""
     for message in found:
-        if isinstance(message, LoopClosure):
+        if isinstance(message, l1.LoopClosure):
             backend.add_loop(message)
         else:
             backend.add_odometry(message)
