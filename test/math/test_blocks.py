@@ -43,17 +43,6 @@ def test_the_matrix_has_the_blocks_in_their_places_and_products_are_its_own(syst
     assert_allclose(system.transposed_times(y), A.T @ y, atol=1e-12)
 
 
-@pytest.mark.parametrize('entries', [slice(0, 2), slice(2, 3)])
-def test_a_part_is_its_rows_and_columns(entries, rng):
-    system = random_system(SHAPES[-2](9), 9, 3, rng)
-    part = system.part(entries)
-    rows, columns = (np.arange(size).reshape(-1, 3)[:, entries].ravel()
-                     for size in system.A.shape)
-    assert_array_equal(part.A.toarray(), system.A.toarray()[np.ix_(rows, columns)])
-    assert_array_equal(part.b, system.b[rows])
-    assert part.block_size == len(range(3)[entries])
-
-
 def test_vectors_and_jacobians_are_whitened(k, rng):
     roots, J = np.triu(rng.standard_normal((7, k, k))), rng.standard_normal((7, 2, k, k))
     e = rng.standard_normal((7, k))

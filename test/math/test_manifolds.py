@@ -259,18 +259,6 @@ def test_headings_come_out_within_half_a_turn(verb, rng):
 # SE(3) alone
 
 
-def test_an_upright_robot_moves_as_in_the_plane(rng):
-    """The residual's turn is 2 sin(angle / 2), so small errors; Jacobians and curvature, too."""
-    flat = rng.uniform(-3, 3, (2, N, 3))
-    z = se2.retract(se2.between(*flat), 1e-7 * rng.standard_normal((N, 3)))
-    flat = (z, *flat)
-    upright = [se2.to_pose3(pose) for pose in flat]
-    plane = np.array([0, 1, 5])
-    assert_allclose(se3.residual(*upright)[:, plane], se2.residual(*flat), atol=1e-14)
-    J = se3.residual_jacobians(*upright)
-    assert_allclose(J[..., plane[:, None], plane], se2.residual_jacobians(*flat), atol=1e-6)
-
-
 def test_what_is_normalised_stays_as_it_is_to_the_last_bit(rng):
     pose3 = np.concatenate((rng.standard_normal((500, 3)), rng.standard_normal((500, 4))), axis=1)
     once = se3.from_pose3(pose3)

@@ -14,8 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from problems import chain_and_loops, chain_of, drive, graph_of
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.spanning_tree import compose_tree, odometry_poses, tree_poses
+from l1slam_ros.core.graph.spanning_tree import odometry_poses, tree_poses
 
 
 def assert_same(a, b):
@@ -38,14 +37,6 @@ def test_odometry_is_the_chain_composed_one_by_one(rng):
         assert_same(poses[k : k + 1], pose)
 
 
-def test_odometry_takes_the_first_of_parallel_factors():
-    graph = FactorGraph(se2, 2)
-    for x in 1.0, 2.0:
-        graph.add_between(1, 0, np.array([[-x, 0, 0]]), np.eye(3)[None])
-    graph.add_between(0, 1, np.array([[3.0, 0, 0]]), np.eye(3)[None])
-    assert_allclose(odometry_poses(graph), [[0, 0, 0], [1, 0, 0]])
-
-
 @pytest.mark.parametrize('root', [0, 7, 39])
 def test_a_tree_from_any_root_puts_keyframe_0_at_the_identity(root, rng):
     truth = drive(40, rng)
@@ -65,19 +56,3 @@ def test_a_tree_takes_the_shortest_way(rng):
     graph = graph_of(truth, [*chain_of(n), *star], noise)
     assert_same(tree_poses(graph, 0), truth)
     assert np.abs(se2.local(odometry_poses(graph), truth)).max() > 0.4
-
-
-def test_a_tree_of_any_shape_is_composed(rng):
-    """Against one composition after the other, for random trees and forests."""
-    for n in (1, 2, 10, 100):
-        order = rng.permutation(n)
-        parent = np.arange(n)
-        for k in range(1, n):
-            parent[order[k]] = order[rng.integers(k)] if rng.random() < 0.95 else order[k]
-        relative = rng.standard_normal((n, 3))
-        poses = compose_tree(se2, parent, relative)
-        for k in range(n):
-            expected = relative[k : k + 1]
-            if parent[k] != k:
-                expected = se2.compose(poses[parent[k]][None], expected)
-            assert_same(poses[k : k + 1], expected)

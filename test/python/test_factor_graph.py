@@ -180,14 +180,3 @@ def test_keyframes_of_several_robots_come_in_any_order(rng):
     motion = compose(poses[:1], between(truth[:1], np.zeros((1, 3))))
     assert_allclose(between(np.array([compose(motion[0], pose) for pose in truth]), poses), 0,
                     atol=1e-6)
-
-
-def test_what_was_seen_of_predecessors_stays():
-    graph = graph_with(4, [(0, 1), (1, 2), (2, 3)])
-    before, copy = graph.predecessor, graph.copy()
-    graph.follow(np.array([2]), NO_PREDECESSOR)
-    graph.add_poses()
-    assert before.tolist() == copy.predecessor.tolist() == [-1, 0, 1, 2]
-    assert graph.predecessor.tolist() == [-1, 0, -1, 2, 3]
-    assert graph.between.is_odometry.tolist() == [True, False, True]
-    assert copy.between.is_odometry.all()
