@@ -9,7 +9,6 @@
 """Problems whose answer is known: hand-solved LPs, random systems, tiny graphs, messages."""
 
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 from scipy.optimize import linprog
@@ -151,21 +150,16 @@ def chain_of(n):
 
 
 def graph_of(truth, pairs, noise=0.0, information=USUAL):
-    """Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3)."""
-    graph = l1.FactorGraph(PLANE, len(truth))
-    measure(graph, truth, *np.array(pairs).T, noise, information)
-    return graph
-
-
-def measure(graph, truth, i, j, noise=0.0, information=USUAL):
     """
-    Append what sees keyframes j from keyframes i, (m,), where they are in truth (n, 3).
+    Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3).
 
     noise : (m, 3) steps applied to the measurements; information : (m, 3, 3); or one for all
     """
+    graph, (i, j) = l1.FactorGraph(PLANE, len(truth)), np.array(pairs).T
     exact = between(truth[i], truth[j])
     graph.add_between(i, j, PLANE.retract(exact, np.broadcast_to(noise, exact.shape)),
                       np.broadcast_to(information, (*exact.shape, 3)))
+    return graph
 
 
 def retold(graph, measurement=None, times=1.0, trusted=None):
@@ -198,6 +192,18 @@ def noisy_graph(n, n_loops, rng, sigma=(0.1, 0.1, 0.05)):
     return graph_of(truth, pairs, noise), truth
 
 
+def straight(n, step=1.0):
+    """Return a drive straight ahead, (n, 3)."""
+    return np.arange(n)[:, None] * np.array([step, 0.0, 0.0])
+
+
+# Messages
+
+
+PERIOD = 0.1  # [s] from one keyframe to the next
+UNKNOWN = np.zeros((6, 6))
+
+
 def seconds(value):
     """Return a stamp [ns]."""
     return round(value * 1e9)
@@ -210,13 +216,10 @@ def covariance6(covariance3):
     return covariance
 
 
-UNKNOWN = np.zeros((6, 6))
-
-
-def odometry(time, pose, covariance=UNKNOWN, twist_covariance=UNKNOWN):
+def odometry(time, pose, covariance=UNKNOWN):
     """Return the sample of a robot at `pose` (3,), `time` in seconds."""
     return l1.OdometrySample(seconds(time), PLANE.to_pose3(np.array(pose, float)), covariance,
-                             twist_covariance)
+                             UNKNOWN)
 
 
 def loop(reference_time, time, pose, covariance=UNKNOWN):
@@ -225,90 +228,21 @@ def loop(reference_time, time, pose, covariance=UNKNOWN):
                           PLANE.to_pose3(np.array(pose, float)), covariance)
 
 
-PERIOD = 0.1  # [s] from one sample to the next
-
-
-def curve(n):
-    """Return a drive along a curve, .12 m and .01 to .05 rad per sample, (n, 3)."""
-    poses = np.zeros((n, 3))
-    for k in range(1, n):
-        step = np.array([[0.12, 0.01, 0.03 + 0.02 * np.sin(k / 5)]])
-        poses[k] = compose(poses[k - 1 : k], step)[0]
-    return poses
-
-
-def true_loop(poses, reference, sample, covariance=UNKNOWN):
-    """Return what sees sample from reference without noise."""
-    pose = between(poses[reference : reference + 1], poses[sample : sample + 1])[0]
-    return loop(reference * PERIOD, sample * PERIOD, pose, covariance)
-
-
-def grown(poses, options, covariance=UNKNOWN):
-    """Return the builder after the samples of `poses` (n, 3), one every .1 s from 0."""
-    from l1slam_ros.core.online.graph_builder import GraphBuilder
-
-    builder = GraphBuilder(PLANE, options)
-    drive_on(builder, poses, covariance=covariance)
-    return builder
-
-
-def drive_on(builder, poses, first=0, covariance=UNKNOWN, start=0.0, period=PERIOD):
-    """Add the samples of `poses` (n, 3) from `first` on, number k at `start` + k `period`."""
-    for k in range(first, len(poses)):
-        builder.add_odometry(odometry(start + k * period, poses[k], covariance))
-
-
-def straight(n, step=1.0):
-    """Return a drive straight ahead, (n, 3)."""
-    return np.arange(n)[:, None] * np.array([step, 0.0, 0.0])
-
-
-def keyframe_samples(builder):
-    """Return which sample each keyframe is, (n,)."""
-    return np.round(builder.keyframe_stamps / seconds(PERIOD)).astype(int)
-
-
-def loops_of(builder):
-    """Return i, j and measurement of all factors that are no odometry."""
-    factors = builder.graph.between
-    rows = ~factors.is_odometry
-    return factors.i[rows].tolist(), factors.j[rows].tolist(), factors.measurement[rows]
-
-
-def covariance_of(builder, row):
-    """Return the covariance of one between factor, (3, 3)."""
-    root = builder.graph.between.sqrt_information[row]
-    return np.linalg.inv(root.T @ root)
-
-
-def messages(graph, first=0, last=None, start=0.0):
-    """
-    Yield samples of the odometry of a graph, and behind each the loops that end there.
-
-    Of keyframes first to last of the graph; number k is at `start` [s] + k `PERIOD`.
-    """
-    factors, manifold = graph.between, graph.manifold
-    stamps = [seconds(start + k * PERIOD) for k in range(graph.n_poses)]
-    pose, measured = manifold.identity(graph.n_poses), manifold.to_pose3(factors.measurement)
-    covariances, said = np.zeros((len(factors), 6, 6)), factors.speaks
-    for k, root in enumerate(factors.sqrt_information):
-        rows = np.array(manifold.COVARIANCE_ROWS)
-        own, silent = rows[said[k]], rows[~said[k]]
-        root = root[np.ix_(said[k], said[k])]
-        covariances[k][np.ix_(own, own)] = np.linalg.inv(root.T @ root)
-        covariances[k, silent, silent] = np.inf
-    for k in np.flatnonzero(factors.step_to >= 0).tolist():
-        before, step = graph.parent[k], factors.measurement[factors.step_to[k]]
-        pose[k] = manifold.compose(pose[before:before + 1], step[None])[0]
-    poses, loops = manifold.to_pose3(pose), ~factors.is_odometry
-    for k in islice(range(graph.n_poses), first, last):
+def messages(graph, first=0, last=None):
+    """Yield the sample of each keyframe of a graph in the plane, and the loops that end there."""
+    factors, pose = graph.between, np.zeros((1, 3))
+    roots = factors.sqrt_information
+    covariances = np.linalg.inv(roots.transpose(0, 2, 1) @ roots)
+    for k in range(graph.n_poses if last is None else last):
         step = factors.step_to[k]
-        yield l1.OdometrySample(stamps[k], poses[k], UNKNOWN if step < 0 else covariances[step],
-                                UNKNOWN)
-        for row in np.flatnonzero(loops & (factors.j == k)):
-            i = factors.i[row]
-            yield l1.LoopClosure(None if i == WORLD else stamps[i], stamps[k], measured[row],
-                                 covariances[row], bool(factors.trusted[row]))
+        if k:
+            pose = compose(pose, factors.measurement[step:step + 1])
+        if k < first:
+            continue
+        yield odometry(k * PERIOD, pose[0], covariance6(covariances[step]))
+        for row in np.flatnonzero(~factors.is_odometry & (factors.j == k)):
+            yield loop(factors.i[row] * PERIOD, k * PERIOD, factors.measurement[row],
+                       covariance6(covariances[row]))
 
 
 def hear(backend, found):
@@ -318,8 +252,3 @@ def hear(backend, found):
             backend.add_loop(message)
         else:
             backend.add_odometry(message)
-
-
-def play(backend, world, first=0, last=None):
-    """Add keyframes first to last and the loops that end there."""
-    hear(backend, messages(world.graph, first, last))
