@@ -11,16 +11,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+from heard import PERIOD, covariance6, hear, loop, odometry, seconds, straight  # noqa: F401
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 from worlds import between, compose
 
 import l1slam_ros as l1
 
-# Every message a keyframe, with the covariance it states: the graph is that of the messages.
-EVERY = l1.BackendOptions.from_mapping({
-    'keyframe': {'translation': 0.0, 'rotation': 0.0, 'period': 0.0},
-    'odometry': {'covariance_source': 'increment'}})
 PLANE = l1.Backend().manifold
 WORLD = -1  # as an end of a factor
 
@@ -190,65 +187,3 @@ def noisy_graph(n, n_loops, rng, sigma=(0.1, 0.1, 0.05)):
     pairs = chain_and_loops(n, n_loops, rng)
     noise = np.array(sigma) * rng.standard_normal((len(pairs), 3))
     return graph_of(truth, pairs, noise), truth
-
-
-def straight(n, step=1.0):
-    """Return a drive straight ahead, (n, 3)."""
-    return np.arange(n)[:, None] * np.array([step, 0.0, 0.0])
-
-
-# Messages
-
-
-PERIOD = 0.1  # [s] from one keyframe to the next
-UNKNOWN = np.zeros((6, 6))
-
-
-def seconds(value):
-    """Return a stamp [ns]."""
-    return round(value * 1e9)
-
-
-def covariance6(covariance3):
-    """Return the (6, 6) covariance of a message whose x, y, yaw have this one, (3, 3)."""
-    covariance = np.zeros((6, 6))
-    covariance[np.ix_((0, 1, 5), (0, 1, 5))] = covariance3
-    return covariance
-
-
-def odometry(time, pose, covariance=UNKNOWN):
-    """Return the sample of a robot at `pose` (3,), `time` in seconds."""
-    return l1.OdometrySample(seconds(time), PLANE.to_pose3(np.array(pose, float)), covariance,
-                             UNKNOWN)
-
-
-def loop(reference_time, time, pose, covariance=UNKNOWN):
-    """Return the loop that saw the robot at `pose` (3,), times in seconds."""
-    return l1.LoopClosure(seconds(reference_time), seconds(time),
-                          PLANE.to_pose3(np.array(pose, float)), covariance)
-
-
-def messages(graph, first=0, last=None):
-    """Yield the sample of each keyframe of a graph in the plane, and the loops that end there."""
-    factors, pose = graph.between, np.zeros((1, 3))
-    roots = factors.sqrt_information
-    covariances = np.linalg.inv(roots.transpose(0, 2, 1) @ roots)
-    for k in range(graph.n_poses if last is None else last):
-        step = factors.step_to[k]
-        if k:
-            pose = compose(pose, factors.measurement[step:step + 1])
-        if k < first:
-            continue
-        yield odometry(k * PERIOD, pose[0], covariance6(covariances[step]))
-        for row in np.flatnonzero(~factors.is_odometry & (factors.j == k)):
-            yield loop(factors.i[row] * PERIOD, k * PERIOD, factors.measurement[row],
-                       covariance6(covariances[row]))
-
-
-def hear(backend, found):
-    """Add samples and loops."""
-    for message in found:
-        if isinstance(message, l1.LoopClosure):
-            backend.add_loop(message)
-        else:
-            backend.add_odometry(message)

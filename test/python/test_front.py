@@ -10,17 +10,15 @@
 
 import numpy as np
 import pytest
+from drives import CREDULOUS, EVERY, STATES, drive, play, played, simulated
+from heard import seconds
 from numpy.testing import assert_allclose
-from problems import EVERY, PERIOD, covariance6, hear, messages, odometry, seconds
-from worlds import false_of, made, whitened
+from worlds import whitened
 
 import l1slam_ros as l1
 
-CREDULOUS = l1.BackendOptions.from_mapping({
-    'keyframe': {'translation': 0.0, 'rotation': 0.0},
-    'odometry': {'covariance_source': 'increment'}, 'robust': {'enabled': False}})
 N, KNOWN = 180, 140
-ACCEPTED = 2  # of waiting, suspect, accepted, rejected, expired
+ACCEPTED = STATES.index('accepted')
 COVARIANCE = np.diag([4e-4, 1e-4, 2e-4, 1e-5, 3e-5, 2e-5])
 
 
@@ -96,32 +94,22 @@ def test_how_sure_the_map_is_of_a_keyframe(dimension, absolute):
 
 def test_of_a_part_that_nothing_joins_hardly_anything_is_known():
     backend = l1.Backend(EVERY)
-
-    def drive(first, count):
-        for k in range(count):
-            backend.add_odometry(odometry(first + k, (k, 0.0, 0.0), covariance6(1e-4 * np.eye(3))))
-        backend.settle()
-        return backend.marginal_covariance(len(backend.poses) - 1)
-
-    known, unknown = drive(100.0, 10), drive(50.0, 3)
-    assert 0 < known[0, 0] < 0.1 and unknown[0, 0] > 50 and unknown[2, 2] > 0.9
-    # Where the clock is set back between two solves, a part of its own begins.
+    drive(backend, 100, 110)
+    backend.settle()
+    assert 0 < backend.marginal_covariance(9)[0, 0] < 0.1
+    drive(backend, 50, 53)  # the clock was set back
+    backend.settle()
+    unknown = backend.marginal_covariance(12)
+    assert unknown[0, 0] > 50 and unknown[2, 2] > 0.9
     with backend.calm:
-        for k in range(4):
-            backend.add_odometry(odometry(1.0 + k, (k, 0.0, 0.0), covariance6(1e-4 * np.eye(3))))
+        drive(backend, 1, 5)
         assert backend.update(0.0) is not None
         assert len(backend.poses) == 17 and np.isfinite(backend.poses).all()
 
 
-@pytest.fixture(scope='module')
-def world(tmp_path_factory):
-    return made(tmp_path_factory.mktemp('world') / 'world.g2o', N, 2 * N)
-
-
 def settled(graph):
     """Return a back end with a settled map of the first keyframes."""
-    backend = l1.Backend(EVERY)
-    hear(backend, messages(graph, 0, KNOWN))
+    backend = played(graph, 0, KNOWN)
     backend.settle()
     return backend
 
@@ -129,13 +117,13 @@ def settled(graph):
 def drive_on(backend, graph, last=N):
     """Add the other keyframes one by one, with an update each."""
     for k in range(KNOWN, last):
-        hear(backend, messages(graph, k, k + 1))
+        play(backend, graph, k, k + 1)
         backend.update(0.0)
     take_all(backend)
 
 
-def test_the_map_stays_near_the_optimum_and_a_bound_of_it_stays_true(world):
-    graph, _ = l1.read_graph(world)
+def test_the_map_stays_near_the_optimum_and_a_bound_of_it_stays_true(tmp_path):
+    graph = simulated(tmp_path, N, 2 * N).graph
     assert np.isnan(l1.Backend(EVERY).behind().bound)
     backend = settled(graph)
     proved = backend.behind()
@@ -164,16 +152,13 @@ def test_the_map_stays_near_the_optimum_and_a_bound_of_it_stays_true(world):
 
 @pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])
 def test_the_gate_lets_no_lie_in(tmp_path, kind):
-    path = made(tmp_path / 'lies.g2o', N, 2 * N, '--false-loops', 130, '--kind', kind)
-    graph, _ = l1.read_graph(path)
-    false = {tuple(sorted(pair)) for pair in false_of(path)}
-    backend = settled(graph)
+    world = simulated(tmp_path, N, 2 * N, '--false-loops', 130, '--kind', kind)
+    backend = settled(world.graph)
     known = len(backend.loop_states().state)
     with backend.calm:
-        drive_on(backend, graph)
+        drive_on(backend, world.graph)
         states = backend.loop_states()
-    pairs = np.round(states.stamps / seconds(PERIOD)).astype(int).tolist()
-    lies = np.array([tuple(pair) in false for pair in pairs])
+    lies = world.is_false(states.stamps)
     new, accepted = np.arange(len(lies)) >= known, states.state == ACCEPTED
     assert np.count_nonzero(lies & new) > 5 and not (lies & accepted).any()
     # The others wait for the judgement.
