@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Minimum degree and what follows from it, against brute-force elimination and SciPy's MMD."""
+"""Minimum degree and dissection, against brute-force elimination and SciPy's MMD."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,6 @@ from scipy.spatial import Delaunay
 from systems import PLENTY, SHAPES
 
 from l1slam_ros.core.kernels import dissection, ordering
-from l1slam_ros.core.kernels.symbolic import postorder
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 NOTHING = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32)
@@ -147,22 +146,3 @@ def test_of_many_streets_separators_spare_a_third_of_the_work(rng):
     assert work(graph, by_levels) < work(graph, by_separators)
     assert dissection.is_promising([by_separators, by_levels])
     assert not dissection.is_promising([by_levels, by_separators])
-
-
-# What follows from an order
-
-
-def test_the_postorder_fills_in_alike(graph):
-    """A topological order of the elimination tree: as many entries, subtrees are runs."""
-    order, column, rows = minimum_degree(*graph)
-    position, parent, below, step = postorder(order, column, rows)
-    assert_array_equal(np.sort(position), np.arange(50))
-    again = np.argsort(position)
-    assert_array_equal(again, order[step])
-    columns = eliminate(*graph, again)
-    assert_array_equal(below, [len(entries) for entries in columns])
-    first = np.array([min((position[k] for k in entries), default=50) for entries in columns])
-    assert_array_equal(parent, first)
-    # In a postorder all between a node and its parent are descendants of the parent.
-    for k in np.flatnonzero(parent < 50):
-        assert (parent[k: parent[k]] <= parent[k]).all()
