@@ -24,7 +24,8 @@ def test_of_the_gamma_distribution(a, probability):
     digits, near_1 = (1e-9, 1e-13) if a > 100 else (1e-12, 1e-15)
     within = max(digits, near_1 / (1 - probability))
     assert gamma_quantile(a, probability) == pytest.approx(gammaincinv(a, probability), rel=within)
-    assert gamma_probability(a, a / 3) == pytest.approx(gammainc(a, a / 3), rel=1e-9, abs=1e-300)
+    for x in a / 3, 3 * a:
+        assert gamma_probability(a, x) == pytest.approx(gammainc(a, x), rel=1e-9, abs=1e-300)
 
 
 @pytest.mark.parametrize('probability', PROBABILITIES)
