@@ -9,22 +9,17 @@
 """Problems whose answer is known: hand-solved LPs, random systems, tiny graphs, messages."""
 
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
+from heard import PERIOD, covariance6, hear, loop, odometry, seconds, straight  # noqa: F401
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
+from worlds import between, compose
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.graph.recording import recorded
-from l1slam_ros.core.online.graph_builder import GraphBuilder
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.running.backend import BackendOptions
+import l1slam_ros as l1
 
-# Every message a keyframe, with the covariance it states: the graph is that of the messages.
-EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
+PLANE = l1.Backend().manifold
+WORLD = -1  # as an end of a factor
 
 
 @dataclass(frozen=True)
@@ -138,7 +133,7 @@ def drive(n, rng):
     poses = np.zeros((n, 3))
     for k in range(1, n):
         step = np.array([[1.0, 0.0, 0.0]]) + [0.2, 0.1, 0.6] * rng.standard_normal((1, 3))
-        poses[k] = se2.compose(poses[k - 1 : k], step)[0]
+        poses[k] = compose(poses[k - 1 : k], step)[0]
     return poses
 
 
@@ -152,27 +147,21 @@ def chain_of(n):
 
 
 def graph_of(truth, pairs, noise=0.0, information=USUAL):
-    """Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3)."""
-    graph = FactorGraph(se2, len(truth))
-    measure(graph, truth, *np.array(pairs).T, noise, information)
-    return graph
-
-
-def measure(graph, truth, i, j, noise=0.0, information=USUAL):
     """
-    Append what sees keyframes j from keyframes i, (m,), where they are in truth (n, 3).
+    Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3).
 
     noise : (m, 3) steps applied to the measurements; information : (m, 3, 3); or one for all
     """
-    exact = se2.between(truth[i], truth[j])
-    graph.add_between(i, j, se2.retract(exact, np.broadcast_to(noise, exact.shape)),
+    graph, (i, j) = l1.FactorGraph(PLANE, len(truth)), np.array(pairs).T
+    exact = between(truth[i], truth[j])
+    graph.add_between(i, j, PLANE.retract(exact, np.broadcast_to(noise, exact.shape)),
                       np.broadcast_to(information, (*exact.shape, 3)))
+    return graph
 
 
 def retold(graph, measurement=None, times=1.0, trusted=None):
     """Return the graph with other measurements (m, p), sigmas that many times (m,), trust (m,)."""
-    factors, other = graph.between, FactorGraph(graph.manifold)
-    other.add_poses(graph.n_poses)
+    factors, other = graph.between, l1.FactorGraph(graph.manifold, graph.n_poses)
     other.append_between(factors.i, factors.j,
                          factors.measurement if measurement is None else measurement,
                          factors.sqrt_information / np.reshape(times, (-1, 1, 1)),
@@ -198,110 +187,3 @@ def noisy_graph(n, n_loops, rng, sigma=(0.1, 0.1, 0.05)):
     pairs = chain_and_loops(n, n_loops, rng)
     noise = np.array(sigma) * rng.standard_normal((len(pairs), 3))
     return graph_of(truth, pairs, noise), truth
-
-
-def seconds(value):
-    """Return a stamp [ns]."""
-    return round(value * 1e9)
-
-
-def covariance6(covariance3):
-    """Return the (6, 6) covariance of a message whose x, y, yaw have this one, (3, 3)."""
-    covariance = np.zeros((6, 6))
-    covariance[np.ix_((0, 1, 5), (0, 1, 5))] = covariance3
-    return covariance
-
-
-UNKNOWN = np.zeros((6, 6))
-
-
-def odometry(time, pose, covariance=UNKNOWN, twist_covariance=UNKNOWN):
-    """Return the sample of a robot at `pose` (3,), `time` in seconds."""
-    return OdometrySample(seconds(time), se2.to_pose3(np.array(pose, float)), covariance,
-                          twist_covariance)
-
-
-def loop(reference_time, time, pose, covariance=UNKNOWN):
-    """Return the loop that saw the robot at `pose` (3,), times in seconds."""
-    return LoopClosure(seconds(reference_time), seconds(time), se2.to_pose3(np.array(pose, float)),
-                       covariance)
-
-
-PERIOD = 0.1  # [s] from one sample to the next
-
-
-def curve(n):
-    """Return a drive along a curve, .12 m and .01 to .05 rad per sample, (n, 3)."""
-    poses = np.zeros((n, 3))
-    for k in range(1, n):
-        step = np.array([[0.12, 0.01, 0.03 + 0.02 * np.sin(k / 5)]])
-        poses[k] = se2.compose(poses[k - 1 : k], step)[0]
-    return poses
-
-
-def true_loop(poses, reference, sample, covariance=UNKNOWN):
-    """Return what sees sample from reference without noise."""
-    pose = se2.between(poses[reference : reference + 1], poses[sample : sample + 1])[0]
-    return loop(reference * PERIOD, sample * PERIOD, pose, covariance)
-
-
-def grown(poses, options, covariance=UNKNOWN):
-    """Return the builder after the samples of `poses` (n, 3), one every .1 s from 0."""
-    builder = GraphBuilder(se2, options)
-    drive_on(builder, poses, covariance=covariance)
-    return builder
-
-
-def drive_on(builder, poses, first=0, covariance=UNKNOWN, start=0.0, period=PERIOD):
-    """Add the samples of `poses` (n, 3) from `first` on, number k at `start` + k `period`."""
-    for k in range(first, len(poses)):
-        builder.add_odometry(odometry(start + k * period, poses[k], covariance))
-
-
-def straight(n, step=1.0):
-    """Return a drive straight ahead, (n, 3)."""
-    return np.arange(n)[:, None] * np.array([step, 0.0, 0.0])
-
-
-def keyframe_samples(builder):
-    """Return which sample each keyframe is, (n,)."""
-    return np.round(builder.keyframe_stamps / seconds(PERIOD)).astype(int)
-
-
-def loops_of(builder):
-    """Return i, j and measurement of all factors that are no odometry."""
-    factors = builder.graph.between
-    rows = ~factors.is_odometry
-    return factors.i[rows].tolist(), factors.j[rows].tolist(), factors.measurement[rows]
-
-
-def covariance_of(builder, row):
-    """Return the covariance of one between factor, (3, 3)."""
-    root = builder.graph.between.sqrt_information[row]
-    return np.linalg.inv(root.T @ root)
-
-
-def messages(graph, first=0, last=None, start=0.0):
-    """
-    Yield samples of the odometry of a graph, and behind each the loops that end there.
-
-    Of keyframes first to last of the graph; number k is at `start` [s] + k `PERIOD`.
-    """
-    stamps = [seconds(start + k * PERIOD) for k in range(graph.n_poses)]
-    for sample, loops in islice(recorded(graph, stamps), first, last):
-        yield sample
-        yield from loops
-
-
-def hear(backend, found):
-    """Add samples and loops."""
-    for message in found:
-        if isinstance(message, LoopClosure):
-            backend.add_loop(message)
-        else:
-            backend.add_odometry(message)
-
-
-def play(backend, world, first=0, last=None):
-    """Add keyframes first to last and the loops that end there."""
-    hear(backend, messages(world.graph, first, last))

@@ -10,7 +10,7 @@
 
 import numpy as np
 
-from l1slam_ros.core.graph.linear_system import LinearSystem, linearise
+from l1slam_ros.core.graph.linear_system import LinearSystem
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, find_pattern
 
 PLENTY = 10**6  # blocks that a factor of these small systems never needs
@@ -93,13 +93,3 @@ def two_parts(n):
 
 
 SHAPES = [chain, star, grid, parallel, tied_down, random_loops, two_parts]
-
-
-def dense_covariance(now):
-    """Return the covariance of all keyframes that are free, by a dense inverse, (n, k, n, k)."""
-    problem = now.problem()
-    loops = ~problem.graph.between.is_odometry
-    system, k = linearise(problem.part, now.views[1].first), problem.graph.manifold.TANGENT_SIZE
-    variance = problem.judgement.variance[loops[problem.judgement.accepted].astype(int)]
-    A = system.A.toarray() / np.sqrt(np.repeat(variance, k))[:, None]
-    return np.linalg.inv(A.T @ A).reshape(system.size, k, system.size, k)
