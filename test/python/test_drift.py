@@ -10,7 +10,7 @@
 
 import numpy as np
 import pytest
-from drives import careful, chain_of, drive_of, laps, solved, with_lies
+from outliers import careful, chain_of, drive_of, laps, solved, with_lies
 
 DRIFT = 0.05
 DOUBT = 'a drift suspected'

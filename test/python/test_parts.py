@@ -10,7 +10,7 @@
 
 import numpy as np
 import pytest
-from drives import careful, chain_of, drive_of, solved
+from outliers import careful, chain_of, drive_of, solved
 from worlds import position_error
 
 SEAM = 199

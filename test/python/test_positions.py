@@ -11,8 +11,8 @@
 import numpy as np
 import pytest
 from command import solve_json
-from drives import careful, chain_of, drive_of, solved
 from numpy.testing import assert_allclose
+from outliers import careful, chain_of, drive_of, solved
 from worlds import between, compose, lines_of
 
 import l1slam_ros as l1

@@ -13,8 +13,8 @@ import re
 import numpy as np
 import pytest
 from command import run
-from drives import careful, drive_of, laps, solved
 from numpy.testing import assert_allclose, assert_array_equal
+from outliers import careful, drive_of, laps, solved
 from worlds import between, compose, made, whitened
 
 import l1slam_ros as l1

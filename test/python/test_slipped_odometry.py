@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import SURE, careful, chain_of, drive_of, laps, solved
+from outliers import SURE, careful, chain_of, drive_of, laps, solved
 from worlds import between, compose
 
 STEP, QUARTER = 200, [0.0, 0.0, np.pi / 2]

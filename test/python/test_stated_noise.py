@@ -13,7 +13,7 @@ import re
 import numpy as np
 import pytest
 from command import run, solve_json
-from drives import SURE, careful, chain_of, drive_of, laps, solved
+from outliers import SURE, careful, chain_of, drive_of, laps, solved
 from worlds import compose, position_error
 
 TIMES = re.compile('the (odometry|loops) (?:is|are) about ([0-9.]+) times as noisy as stated')
