@@ -166,10 +166,11 @@ class Map:
         return np.count_nonzero(~self.accepted & ~self.drive.false)
 
 
-def solved(drive, norm='l2', ids=None):
-    """Solve a drive as `l1slam solve` does; return its `Map`."""
+def solved(drive, norm='l2', ids=None, trusted=()):
+    """Solve a drive, of which a person vouches for some pairs; return its `Map`."""
     with tempfile.TemporaryDirectory() as name:
         path, output = drive.write(Path(name) / 'a.g2o', ids), Path(name) / 'b.g2o'
+        Path(f'{path}.trusted.txt').write_text(''.join(f'{i} {j}\n' for i, j in trusted))
         said = StringIO()
         with redirect_stdout(said), redirect_stderr(StringIO()):
             code = main(['solve', str(path), '--json', '--output', str(output), '--norm', norm])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from command import run
 from numpy.testing import assert_allclose, assert_array_equal
-from outliers import careful, drive_of, laps, solved
+from outliers import careful, chain_of, drive_of, laps, solved
 from worlds import between, compose, made, whitened
 
 import l1slam_ros as l1
@@ -101,6 +101,19 @@ def test_a_loop_told_twice_vouches_for_nothing():
     assert_array_equal(twice.accepted, np.append(once.accepted, once.accepted[loops]))
     assert twice.doubts == once.doubts and twice.slips == once.slips == [200]
     assert twice.said['confidence'] == pytest.approx(once.said['confidence'], rel=1e-9)
+
+
+@pytest.mark.parametrize('trusted', [True, False])
+def test_what_a_person_vouches_for_is_in_and_others_may_lean_on_it(trusted):
+    """Two loops that agree, far off the odometry: both are in if one is vouched for."""
+    rng, angle = np.random.default_rng(0), 2 * np.pi * np.arange(160) / 200
+    truth = np.column_stack((32 * np.sin(angle), 32 * (1 - np.cos(angle)), angle))
+    sigmas = np.array([0.3, 0.3, 0.03])
+    drive = drive_of(truth).seen(
+        chain_of(160), sigmas * rng.standard_normal((159, 3)), np.diag(sigmas**-2))
+    drive = drive.seen([(10, 100), (11, 101)], [0.0, 0.0, 2.5], np.diag([100.0, 100.0, 1e3]))
+    found = solved(drive, trusted=[(10, 100)] * trusted)
+    assert found.accepted[-2:].tolist() == [trusted, trusted]
 
 
 @pytest.mark.parametrize(('odometry', 'loops'), [
