@@ -9,8 +9,7 @@
 """A few rooms, what a laser sees in them, and a robot that drives through them with bad wheels."""
 
 import numpy as np
-
-from l1slam_ros.core.geometry import se2
+from worlds import between, compose
 
 RAYS = 360
 # x0, y0, x1, y1 of walls [m]: a ring of corridors with doors and pillars, none like another.
@@ -51,12 +50,12 @@ def laps(count, step=0.1):
 
 def by_wheels(poses, rng, way=0.03, turn=0.02):
     """Return the poses as wheels have them: they stretch ways, and turn a little all the time."""
-    motion = se2.between(poses[:-1], poses[1:])
+    motion = between(poses[:-1], poses[1:])
     length = np.hypot(motion[:, 0], motion[:, 1])
     motion[:, 0] *= 1 + way
     motion[:, 2] = motion[:, 2] * (1 + turn) + turn * length
     motion += rng.normal(0, 1, motion.shape) * (0.003, 0.001, 0.002)
-    found = [np.zeros((1, 3))]
+    found = [np.zeros(3)]
     for one in motion:
-        found.append(se2.compose(found[-1], one[None]))
-    return np.concatenate(found)
+        found.append(compose(found[-1], one))
+    return np.array(found)

@@ -8,13 +8,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot on square laps, the loops it sees one lap back, and what drivers do to its odometry."""
 
-
 import numpy as np
-from lies import position_error
-from problems import covariance6, seconds
+from worlds import between, compose, position_error
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+import l1slam_ros as l1
 
 # At 1 m/s round four corners of 1 m radius.
 LAP = 40.0  # [s]
@@ -30,10 +27,16 @@ def at(time):
     straight = _SIDE - _CORNER
     angle = np.maximum(rest - straight, 0.0)
     on = np.column_stack((np.minimum(rest, straight) + np.sin(angle), 1 - np.cos(angle), angle))
-    corners, step = [se2.identity(1)], np.array([[straight + 1.0, 1.0, np.pi / 2]])
+    corners, step = [np.zeros(3)], np.array([straight + 1.0, 1.0, np.pi / 2])
     for _ in range(3):
-        corners.append(se2.compose(corners[-1], step))
-    return se2.compose(np.concatenate(corners)[side.astype(int) % 4], on)
+        corners.append(compose(corners[-1], step))
+    return compose(np.array(corners)[side.astype(int) % 4], on)
+
+
+def pose3_of(pose):
+    """Return x y z qx qy qz qw of a pose (3,), (7,)."""
+    x, y, theta = pose
+    return np.array([x, y, 0, 0, 0, np.sin(theta / 2), np.cos(theta / 2)])
 
 
 class Laps:
@@ -53,31 +56,30 @@ class Laps:
         self.lap = LAP / speed
         self.times = np.arange(round(laps * self.lap * rate)) / rate
         truth = at(self.times * speed)
-        steps = se2.between(truth[:-1], truth[1:])
+        steps = between(truth[:-1], truth[1:])
         # Half of it is the same all the way: a wheel's radius, a gyro's scale.
         error = 1 + rng.normal(0, 0.01, 3) + rng.normal(0, 0.01 * np.sqrt(rate), steps.shape)
-        odometry = [se2.identity(1)]
+        odometry = [np.zeros(3)]
         for step in steps * error:
-            odometry.append(se2.compose(odometry[-1], step[None]))
-        self.odometry = np.concatenate(odometry)
-        length, angle = se2.motion(np.vstack((steps, steps[-1:])) * rate * twist)
-        self.speeds = [*zip(length.tolist(), angle.tolist(), strict=True)]
+            odometry.append(compose(odometry[-1], step))
+        self.odometry = np.array(odometry)
+        x, y, angle = (np.vstack((steps, steps[-1:])) * rate * twist).T
+        self.speeds = [*zip(np.hypot(x, y).tolist(), np.abs(angle).tolist(), strict=True)]
         ends = np.arange(self.lap, self.times[-1], 0.5 / speed)
         begins = ends - self.lap
-        measured = se2.retract(se2.between(at(begins * speed), at(ends * speed)),
-                               LOOP_SIGMA * rng.standard_normal((len(ends), 3)))
-        self.loops = [LoopClosure(stamp(begin), stamp(end), se2.to_pose3(Z[None])[0],
-                                  covariance6(np.diag(LOOP_SIGMA**2)))
+        measured = compose(between(at(begins * speed), at(ends * speed)),
+                           LOOP_SIGMA * rng.standard_normal((len(ends), 3)))
+        covariance = np.diag(np.insert(LOOP_SIGMA, 2, np.zeros(3))**2)
+        self.loops = [l1.LoopClosure(stamp(begin), stamp(end), pose3_of(Z), covariance)
                       for begin, end, Z in zip(begins, ends, measured, strict=True)]
 
-
     def sample(self, k, pose=None, covariance=None):
-        """Return the message of number k; pose (1, 3) : what it says."""
-        pose3 = se2.to_pose3(self.odometry[k:k + 1] if pose is None else pose)[0]
+        """Return the message of number k; pose (3,) : what it says."""
+        pose3 = pose3_of(self.odometry[k] if pose is None else pose)
         none = np.zeros((6, 6))
-        return OdometrySample(stamp(self.times[k]), pose3,
-                              none if covariance is None else covariance, none, '',
-                              self.speeds[k])
+        return l1.OdometrySample(stamp(self.times[k]), pose3,
+                                 none if covariance is None else covariance, none, '',
+                                 self.speeds[k])
 
     def samples(self):
         """Return all messages of the odometry."""
@@ -91,10 +93,10 @@ class Laps:
         """Return the messages of odometry that begins again at `where` (3,) after a silence."""
         last = int(np.searchsorted(self.times, begin, side='right')) - 1
         first = last + max(round(silence / self.period), 1)
-        start = self.odometry[last:last + 1] if where is SAME else np.array([where], float)
-        frame = se2.compose(start, se2.inverse(self.odometry[first:first + 1]))
+        start = self.odometry[last] if where is SAME else np.array(where, float)
+        frame = compose(start, between(self.odometry[first], np.zeros(3)))
         return [self.sample(k) for k in range(last + 1)] + [
-            self.sample(k, se2.compose(frame, self.odometry[k:k + 1]))
+            self.sample(k, compose(frame, self.odometry[k]))
             for k in range(first, len(self.times))]
 
     def heard(self, samples):
@@ -111,8 +113,8 @@ class Laps:
 
     def error(self, snapshot):
         """Return the RMSE of the positions of the keyframes [m]."""
-        return position_error(
-            snapshot.poses, at((snapshot.stamps - stamp(0.0)) * 1e-9 * self.speed))
+        truth = at((snapshot.stamps - stamp(0.0)) * 1e-9 * self.speed)
+        return position_error(snapshot.poses[:, :2], truth[:, :2])
 
 
 # In the place of a pose: that of the last message before.
@@ -121,7 +123,7 @@ SAME = object()
 
 def stamp(time):
     """Return the stamp some seconds after the start [ns]."""
-    return seconds(START + time)
+    return round((START + time) * 1e9)
 
 
 def late(samples, share, delay, rng):

@@ -10,11 +10,11 @@
 
 import numpy as np
 import pytest
-from lies import careful_world
+from worlds import made
 
-from l1slam_ros.core import kernels
-from l1slam_ros.core.geometry import se2
+import l1slam_ros as l1
 from l1slam_ros.core.graph.linear_system import linearise
+from l1slam_ros.core.kernels.prediction import normalise_pairs
 from l1slam_ros.core.robust.innovation import (
     TAIL,
     chi2_quantile,
@@ -26,25 +26,30 @@ from l1slam_ros.core.robust.innovation import (
     spread_of,
     student_quantile,
 )
+from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
-from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
-
-
-def loops_of(graph):
-    """Return the rows of the loops."""
-    return np.flatnonzero(~graph.between.is_odometry)
 
 
 @pytest.fixture(scope='module')
-def solved():
+def whole(tmp_path_factory):
+    """Return a graph with 101 true loops."""
+    path = made(tmp_path_factory.mktemp('world') / 'a.g2o', 120, 220)
+    return l1.read_graph(path)[0]
+
+
+def solved_without(graph, rows):
+    """Return the graph without some factors, these, and the L2 map of the rest."""
+    out = np.isin(np.arange(len(graph.between)), rows)
+    part = graph.subset(~out)
+    return part, graph.subset(out), l1.solve(part, norm='l2', robust=False).poses
+
+
+@pytest.fixture(scope='module')
+def solved(whole):
     """Return a graph without its last loops, these loops, the L2 map and the posterior."""
-    graph = careful_world(120, 220).graph
-    left_out = np.isin(np.arange(len(graph.between)), loops_of(graph)[-20:])
-    part = graph.subset(~left_out)
-    cholesky = cholesky_of(part)
-    poses = minimise_l2(part, careful_world(120, 220).truth, LeastSquaresOptions(), cholesky).poses
-    posterior = sample_posterior(part, poses, cholesky)
-    return part, graph.subset(left_out), poses, posterior
+    loops = np.flatnonzero(~whole.between.is_odometry)
+    part, others, poses = solved_without(whole, loops[-20:])
+    return part, others, poses, sample_posterior(part, poses, cholesky_of(part))
 
 
 def dense_squares(part, others, poses):
@@ -64,27 +69,11 @@ def test_sampled_squares_are_about_the_exact_ones(solved):
     assert ratio.min() > 0.4 and ratio.max() < 4
 
 
-def test_a_factor_left_out_is_as_far_off_as_if_it_had_never_been_there(solved):
-    part, others, poses, posterior = solved
-    whole = careful_world(120, 220).graph
-    cholesky = cholesky_of(whole)
-    best = minimise_l2(whole, poses, LeastSquaresOptions(), cholesky).poses
-    inside = sample_posterior(whole, best, cholesky).left_out()
-    row = loops_of(whole)[-1]
-    without = whole.subset(np.arange(len(whole.between)) != row)
-    best = minimise_l2(without, poses, LeastSquaresOptions(), cholesky_of(without)).poses
-    alone = dense_squares(without, whole.subset(np.array([row])), best)[0]
-    assert inside[row] == pytest.approx(alone, rel=0.8)
-
-
-def test_a_map_that_is_not_quite_at_its_optimum_says_the_same_of_each_factor(solved):
-    part, _, poses, posterior = solved
-    off = se2.retract(poses, 3e-4 * np.random.default_rng(0).standard_normal(poses.shape))
-    off[0] = poses[0]
-    whitened = [(linearise(part, at).b ** 2).sum() for at in (poses, off)]
-    assert 1e-3 < whitened[1] - whitened[0] < 1
-    again = sample_posterior(part, off, cholesky_of(part))
-    assert again.residual == pytest.approx(posterior.residual, abs=1e-3)
+def test_a_factor_left_out_is_as_far_off_as_if_it_had_never_been_there(whole):
+    poses = l1.solve(whole, norm='l2', robust=False).poses
+    inside = sample_posterior(whole, poses, cholesky_of(whole)).left_out()
+    row = np.flatnonzero(~whole.between.is_odometry)[-1]
+    assert inside[row] == pytest.approx(dense_squares(*solved_without(whole, row))[0], rel=0.8)
 
 
 def test_the_noise_that_there_is_shows_in_the_map_by_the_weights_that_are_stated(solved):
@@ -119,12 +108,12 @@ def test_the_density_of_a_true_residual_has_volume_one():
     assert density.sum() * (x[1] - x[0]) ** 3 == pytest.approx(1, rel=1e-3)
 
 
-def test_a_corridor_does_not_narrow_what_false_factors_claim():
+def test_a_corridor_does_not_narrow_what_false_factors_claim(whole):
     rng = np.random.default_rng(0)
     straight = np.zeros((500, 3))
     straight[:, 0] = np.arange(500)
     area = np.column_stack((rng.uniform(0, 500, (500, 2)) / np.sqrt(2), np.zeros(500)))
-    along, about = (claimed_volume(se2, poses) for poses in (straight, area))
+    along, about = (claimed_volume(whole.manifold, poses) for poses in (straight, area))
     assert along == pytest.approx(about, abs=0.3)
 
 
@@ -136,7 +125,7 @@ def test_pairs_are_normalised_as_their_whole_covariance_says(k, rng):
     first, second = np.triu_indices(m, 1)
     first, second = np.append(second, first), np.append(first, second)  # either way round
     blocks = shared.reshape(m, k, m, k)[np.arange(m), :, np.arange(m)] + np.eye(k)
-    square, log_det = kernels.prediction.normalise_pairs(blocks, residual, shared, first, second)
+    square, log_det = normalise_pairs(blocks, residual, shared, first, second)
     rows = np.arange(m * k).reshape(m, k)
     for a, b, found, log in zip(first, second, square, log_det, strict=True):
         own = np.append(rows[a], rows[b])
@@ -147,6 +136,17 @@ def test_pairs_are_normalised_as_their_whole_covariance_says(k, rng):
 
 def test_a_pair_that_is_not_definite_is_infinitely_far_off():
     shared = np.full((6, 6), 2.0)
-    square, log_det = kernels.prediction.normalise_pairs(
+    square, log_det = normalise_pairs(
         np.stack((np.eye(3), np.eye(3))), np.ones((2, 3)), shared, np.array([0]), np.array([1]))
     assert square == np.inf and log_det == -np.inf
+
+
+@pytest.mark.parametrize(('shared', 'together'), [(0.0, False), (0.5, True), (1.0, True)])
+def test_sums_over_places_tell_whether_loops_err_together(shared, together):
+    rng = np.random.default_rng(0)
+    place, found = np.repeat(np.arange(9), 20), 0
+    for _ in range(50):
+        own, common = (rng.standard_normal((size, 3)) for size in (180, 9))
+        residual = np.sqrt(1 - shared) * own + np.sqrt(shared) * common[place]
+        found += err_together(place, residual, rng.standard_normal((180, 3, 24)))
+    assert found == 50 * together
