@@ -8,41 +8,57 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures every test may ask for."""
 
+import io
 import os
 import signal
+import socket
 import subprocess
-from contextlib import suppress
+import tempfile
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds import made
 
-from l1slam_ros.io.compilation import STEPS, compile_now
-from l1slam_ros.ros.shell.domain import go_where_nobody_is
-from l1slam_ros.ros.shell.middleware import use_what_is_there
+from l1slam_ros.cli.main import main
+
+
+def _own_domain():
+    """Return a ROS domain that nobody on this machine is in, and what marks it as taken."""
+    for k in range(101):
+        domain = 1 + (os.getpid() + k) % 101
+        taken = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
+        try:
+            # What DDS is discovered by, which must be free, and what it leaves alone.
+            for offset, one in zip((0, 5), taken, strict=True):
+                one.bind(('', 7400 + 250 * domain + offset))
+        except OSError:
+            continue
+        taken[0].close()
+        return str(domain), taken[1]
+    raise OSError('each ROS domain is in use on this machine')
+
 
 # Whatever the shell says, before anything of ROS is imported, and for all that is started. No
-# robot nearby hears the tests, nor they it.
-_MIDDLEWARE = ''
-with suppress(ImportError):  # there is no ROS
-    _MIDDLEWARE = use_what_is_there()
-go_where_nobody_is()
-# Tests read what ROS logs.
-for _name in [name for name in os.environ if name.startswith('RCUTILS_')]:
-    del os.environ[_name]
-
-
-def pytest_report_header():
-    """Say what is used in place of what the shell names."""
-    return _MIDDLEWARE or None
+# robot nearby hears the tests, nor they it. Tests read what ROS logs.
+_ABOUT_THE_INSTALLATION = {'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION'}
+for _name in {*os.environ} - _ABOUT_THE_INSTALLATION:
+    if _name.startswith(('ROS_', 'RCL_', 'RCUTILS_', 'RMW_', 'FAST', 'CYCLONEDDS_', 'ZENOH_')):
+        del os.environ[_name]
+os.environ['ROS_DOMAIN_ID'], _MARK = _own_domain()
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 
 def pytest_sessionstart(session):
-    """Compile before the first test: a solve that compiles takes long, and says so."""
-    if not hasattr(session.config, 'workerinput'):
-        capture = session.config.pluginmanager.getplugin('capturemanager')
-        with capture.global_and_fixture_disabled():
-            compile_now(STEPS)
+    """Solve once before the first test: a solve that compiles takes long, and says so."""
+    if hasattr(session.config, 'workerinput') or os.environ.get('NUMBA_DISABLE_JIT'):
+        return
+    capture = session.config.pluginmanager.getplugin('capturemanager')
+    with capture.global_and_fixture_disabled(), tempfile.TemporaryDirectory() as folder:
+        world = made(Path(folder) / 'world.g2o', 30, 45)
+        with redirect_stdout(io.StringIO()):
+            assert main(['solve', str(world), '--solver', 'primal-dual']) == 0
 
 
 def pytest_collection_modifyitems(items):
@@ -100,8 +116,8 @@ def bench(ros):
         return benches[-1]
 
     yield make
-    for made in benches:
-        made.close()
+    for one in benches:
+        one.close()
 
 
 @pytest.fixture

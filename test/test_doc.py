@@ -12,7 +12,6 @@ import json
 import os
 import re
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -41,14 +40,14 @@ WALK = 'python benchmarks/ros/walk.py'
 NOT_RUN = {
     'make ': 'makes an environment from PyPI; test_make.py and ros/test_demo.py hold its parts',
     'rosdep ': 'no ROS installation here',
-    'source install': 'no ROS installation here; test_builds.py sources a workspace',
-    'colcon ': 'no ROS installation here; test_package.py and test_builds.py build the package',
+    'source install': 'no ROS installation here; test_package.py sources a workspace',
+    'colcon ': 'no ROS installation here; test_package.py builds the package',
     'ros2 ': 'no ros2cli here; its nodes are run as .venv/bin/..., and by test_launch.py',
     'rviz2 ': 'no RViz here; its layout is held to the topics by test/node',
     'apt-get ': 'installs packages of the system',
-    'pip install': 'fetches from PyPI; test_builds.py installs what is built',
+    'pip install': 'fetches from PyPI; test_package.py installs what is built',
     'ament_': 'linters of ROS; test_release.py runs them',
-    'python -m build': 'test_builds.py builds both',
+    'python -m build': 'test_package.py builds both',
     'python benchmarks/': MINUTES,
     'l1slam solve $DATASETS/lidar': 'takes long; test_scans.py maps the logs',
     'mkdir /sys/fs/cgroup': 'needs the rights of root and control groups',
