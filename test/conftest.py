@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures every test may ask for."""
 
+import atexit
 import io
 import os
 import signal
@@ -46,7 +47,8 @@ _ABOUT_THE_INSTALLATION = {'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION'}
 for _name in {*os.environ} - _ABOUT_THE_INSTALLATION:
     if _name.startswith(('ROS_', 'RCL_', 'RCUTILS_', 'RMW_', 'FAST', 'CYCLONEDDS_', 'ZENOH_')):
         del os.environ[_name]
-os.environ['ROS_DOMAIN_ID'], _MARK = _own_domain()
+os.environ['ROS_DOMAIN_ID'], _mark = _own_domain()
+atexit.register(_mark.close)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 
