@@ -35,8 +35,10 @@ def _own_domain():
             for offset, one in zip((0, 5), taken, strict=True):
                 one.bind(('', 7400 + 250 * domain + offset))
         except OSError:
+            taken[1].close()
             continue
-        taken[0].close()
+        finally:
+            taken[0].close()
         return str(domain), taken[1]
     raise OSError('each ROS domain is in use on this machine')
 
