@@ -49,7 +49,7 @@ NOT_RUN = {
     'ament_': 'linters of ROS; test_release.py runs them',
     'python -m build': 'test_package.py builds both',
     'python benchmarks/': MINUTES,
-    'l1slam solve $DATASETS/lidar': 'takes long; test_scans.py maps the logs',
+    'l1slam solve $DATASETS/lidar': 'takes long; test_scans.py maps the log',
     'mkdir /sys/fs/cgroup': 'needs the rights of root and control groups',
     'echo 1G > /sys/fs/cgroup': 'needs the rights of root and control groups',
     'echo 200000 > /sys/fs/cgroup': 'needs the rights of root and control groups',

@@ -43,7 +43,7 @@ def contents(path):
 @pytest.fixture(scope='module')
 def lies(tmp_path_factory):
     """A world with 20 lies."""
-    return made(tmp_path_factory.mktemp('lies') / 'world.g2o', 600, 2400, '--seed', 3,
+    return made(tmp_path_factory.mktemp('lies') / 'world.g2o', 300, 900, '--seed', 3,
                 '--false-loops', 20)
 
 
