@@ -148,7 +148,7 @@ def test_what_a_file_says_in_vain_is_warned_of(world):
 @pytest.mark.parametrize('call, said', [
     (lambda graph, _: l1.solve('world.g2o'),
      "graph is 'world.g2o', expected a FactorGraph, as read_graph returns first"),
-    (lambda graph, poses: l1.solve((graph, poses)), 'graph is (<l1slam_ros.core.graph.factor_gra'),
+    (lambda graph, poses: l1.solve((graph, poses)), 'graph is (<l1slam_ros.'),
     (lambda graph, _: l1.solve(graph, robust='no'), "robust is 'no', expected True or False"),
     (lambda graph, _: l1.solve(graph, robust=1), 'robust is 1, expected True or False'),
     (lambda graph, _: l1.solve(graph, norm=['l1']), "norm is ['l1'], expected one of l1, "),
