@@ -52,8 +52,7 @@ _ACT = """<script>
   if (parent !== window) parent.postMessage(made.outerHTML, '*');
 }})();
 </script>"""
-# No window of a browser is as narrow as a phone; a frame in it is. And one browser opens several
-# pages sooner than several browsers.
+# One browser opens several pages sooner than several browsers.
 _FRAMES = """<!DOCTYPE html><body>{frames}
 <script>
 const found = new Map(), frames = [...document.querySelectorAll('iframe')];
@@ -63,7 +62,7 @@ addEventListener('message', event => {{
     document.body.innerHTML = frames.map((one, k) => found.get(k)).join('');
 }});
 </script>"""
-_FRAME = '<iframe src="page{number}.html" width="{width}" height="844"></iframe>'
+_FRAME = '<iframe src="page{number}.html" width="1400" height="844"></iframe>'
 
 
 def browser():
@@ -75,28 +74,20 @@ def browser():
     return path
 
 
-def opened(page, script, width=0):
-    """
-    Open a copy of a page, run a script in it, return what that returns and complaints.
-
-    width : of a frame that the page is in, in pixels; 0: it is as wide as the window
-    """
-    return _opened([page], script, width)[0]
+def opened(page, script):
+    """Open a copy of a page, run a script in it, return what that returns and complaints."""
+    return opened_together([page], script)[0]
 
 
 def opened_together(pages, script):
     """Open copies of pages beside each other in one browser, see `opened`; return a list."""
-    return _opened(pages, script, 1400)
-
-
-def _opened(pages, script, width):
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        frames = ''.join(_FRAME.format(number=k, width=width) for k in range(len(pages)))
+        frames = ''.join(_FRAME.format(number=k) for k in range(len(pages)))
         copies = {f'page{k}.html': _acting(page, script) for k, page in enumerate(pages)}
         for name, text in {**copies, 'frames.html': _FRAMES.format(frames=frames)}.items():
             with open(f'{folder}/{name}', 'w', encoding='utf-8') as file:
                 file.write(text)
-        shown = 'frames' if width else 'page0'
+        shown = 'frames' if len(pages) > 1 else 'page0'
         ran = subprocess.run(
             [browser(), *_OPTIONS, f'--user-data-dir={folder}/profile',
              '--virtual-time-budget=30000', '--dump-dom', f'file://{folder}/{shown}.html'],

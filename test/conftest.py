@@ -8,56 +8,61 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures every test may ask for."""
 
+import atexit
+import io
 import os
 import signal
 import socket
 import subprocess
-from contextlib import suppress
+import tempfile
+from contextlib import redirect_stdout
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from worlds import made
 
 from l1slam_ros.cli.main import main
 
-# A step of 1 m in the plane and in space, known to 1 m and 1 rad.
-IN_THE_PLANE = 'EDGE_SE2 {} {} 1 0 0 ' + '1 0 0 1 0 1'
-IN_SPACE = 'EDGE_SE3:QUAT {} {} 1 0 0 0 0 0 1 ' + '1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1'
 
-# No robot nearby hears the tests, nor they it: what the shell says of ROS is forgotten, before
-# anything of it is imported, and for all that is started.
-for _name in [name for name in os.environ
-              if name.startswith(('RCUTILS_', 'ROS_', 'RMW_', 'FASTRTPS_', 'FASTDDS_'))]:
-    del os.environ[_name]
+def _own_domain():
+    """Return a ROS domain that nobody on this machine is in, and what marks it as taken."""
+    for k in range(101):
+        domain = 1 + (os.getpid() + k) % 101
+        taken = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
+        try:
+            # What DDS is discovered by, which must be free, and what it leaves alone.
+            for offset, one in zip((0, 5), taken, strict=True):
+                one.bind(('', 7400 + 250 * domain + offset))
+        except OSError:
+            taken[1].close()
+            continue
+        finally:
+            taken[0].close()
+        return str(domain), taken[1]
+    raise OSError('each ROS domain is in use on this machine')
+
+
+# Whatever the shell says, before anything of ROS is imported, and for all that is started. No
+# robot nearby hears the tests, nor they it. Tests read what ROS logs.
+_ABOUT_THE_INSTALLATION = {'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION'}
+for _name in {*os.environ} - _ABOUT_THE_INSTALLATION:
+    if _name.startswith(('ROS_', 'RCL_', 'RCUTILS_', 'RMW_', 'FAST', 'CYCLONEDDS_', 'ZENOH_')):
+        del os.environ[_name]
+os.environ['ROS_DOMAIN_ID'], _mark = _own_domain()
+atexit.register(_mark.close)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 
-def _domain():
-    """Return a ROS domain, and what marks it as taken: a port that DDS leaves alone."""
-    for k in range(101):
-        domain = 1 + (os.getpid() + k) % 101
-        mark = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        with suppress(OSError):
-            mark.bind(('', 7400 + 250 * domain + 5))
-            return str(domain), mark
-        mark.close()
-    raise RuntimeError('each ROS domain is in use on this machine')
-
-
-os.environ['ROS_DOMAIN_ID'], _MARK = _domain()
-
-
 def pytest_sessionstart(session):
-    """Compile before the first test: a solve that compiles takes long, and says so."""
-    if hasattr(session.config, 'workerinput'):
+    """Solve once before the first test: a solve that compiles takes long, and says so."""
+    if hasattr(session.config, 'workerinput') or os.environ.get('NUMBA_DISABLE_JIT'):
         return
     capture = session.config.pluginmanager.getplugin('capturemanager')
-    with capture.global_and_fixture_disabled(), TemporaryDirectory() as folder:
-        for step in (IN_THE_PLANE, IN_SPACE):
-            graph = Path(folder, 'steps.g2o')
-            graph.write_text(f'{step}\n{step}\n'.format(0, 1, 1, 2))
-            assert main(['solve', str(graph), '--output', str(Path(folder, 'solved.g2o'))]) == 0
+    with capture.global_and_fixture_disabled(), tempfile.TemporaryDirectory() as folder:
+        world = made(Path(folder) / 'world.g2o', 30, 45)
+        with redirect_stdout(io.StringIO()):
+            assert main(['solve', str(world), '--solver', 'primal-dual']) == 0
 
 
 def pytest_collection_modifyitems(items):
@@ -115,8 +120,8 @@ def bench(ros):
         return benches[-1]
 
     yield make
-    for made in benches:
-        made.close()
+    for one in benches:
+        one.close()
 
 
 @pytest.fixture

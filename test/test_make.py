@@ -68,10 +68,6 @@ def test_the_demo_installs_what_it_needs_once_and_the_tests_only_add_to_it(check
     assert make(checkout, 'demo')[:2] == (0, DEMO[1:])
 
 
-def test_the_tests_work_first_and_alone(checkout):
-    assert make(checkout, 'test')[:2] == (0, [VENV, DEMO[0], *TEST])
-
-
 @pytest.mark.parametrize('target', ['demo', 'test'])
 def test_what_pip_left_half_done_is_made_anew(checkout, target):
     if target == 'test':

@@ -6,52 +6,103 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What is built and installed: metadata that agree, files in their place, a core without ROS."""
+"""What is built runs: sdist and wheel by pip, on several Pythons, and colcon workspaces."""
 
 import importlib.metadata
+import json
+import os
 import re
 import shutil
+import signal
 import stat
 import subprocess
 import sys
+import sysconfig
+import tarfile
 import zipfile
+from contextlib import contextmanager
 from email import message_from_bytes
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from environments import (
+    environment,
+    interpreter,
+    lent_variables,
+    new_environment,
+    own_variables,
+    run,
+)
+from hidden import without
 from packaging.requirements import Requirement
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
+PATIENCE = 60.0  # [s] for a node to end
 EXECUTABLES = {'backend', 'scan_loops', 'replay', 'l1slam'}
+OF_ROS = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs',
+          'rcl_interfaces', 'sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs')
+# EmPy comes without a wheel.
+COLCON = ('colcon-bash', 'colcon-output', 'colcon-ros', 'setuptools<80', '--no-binary=empy')
 
-# Run first in a fresh interpreter: ROS and its messages cannot be imported.
-WITHOUT_ROS = """
-import sys
+# What `l1slam` makes of one small world, run in a folder of its own.
+SMOKE = """
+import contextlib, importlib.util, io, json, sys
+import numpy
+from l1slam_ros.cli.main import main
 
-class Wall:
-    def find_spec(self, name, path=None, target=None):
-        top = name.split('.')[0]
-        if top in ('rclpy', 'builtin_interfaces') or top.endswith('_msgs') or top == 'std_srvs':
-            raise ImportError(f'{name} is behind the wall')
+def run(*arguments):
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert main([*arguments]) == 0, arguments
+    return printed.getvalue()
 
-sys.meta_path.insert(0, Wall())
+def cost(*arguments):
+    # What judges loops would have to be compiled, too.
+    return json.loads(run('solve', *arguments, '--no-robust', '--json'))['final_cost']
+
+run('simulate', 'world.g2o', '--poses', '150', '--edges', '250', '--seed', '7')
+run('convert', 'world.g2o', 'bag')
+run('convert', 'bag', 'back.g2o')
+odometry = ('--start', 'odometry', '--outer', '0')
+print(json.dumps({
+    'python': '%d.%d' % sys.version_info[:2],
+    'numpy': numpy.__version__,
+    'ros': importlib.util.find_spec('rclpy') is not None,
+    'costs': [cost('world.g2o', *odometry), cost('bag', *odometry), cost('back.g2o', *odometry),
+              cost('world.g2o', '--norm', 'l2'), cost('world.g2o', '--outer', '3')],
+}))
 """
 
 
 @pytest.fixture(scope='module')
-def wheel(tmp_path_factory):
-    """Build the wheel of a copy, so that nothing is left in the checkout, and open it."""
-    source, built = tmp_path_factory.mktemp('source') / 'copy', tmp_path_factory.mktemp('built')
-    ignored = shutil.ignore_patterns('.*', '*.egg-info', 'build', 'demo', '__pycache__')
-    shutil.copytree(ROOT, source, ignore=ignored, symlinks=True)
+def source(tmp_path_factory):
+    """Return a copy of the checkout, so that nothing is left in it."""
+    copy = tmp_path_factory.mktemp('source') / 'l1slam_ros'
+    ignored = shutil.ignore_patterns('.*', '*.egg-info', '__pycache__', 'build', 'install', 'log',
+                                     'dist', 'demo')
+    return shutil.copytree(ROOT, copy, ignore=ignored, symlinks=True)
+
+
+@pytest.fixture(scope='module')
+def sdist(source, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('sdist')
+    run(sys.executable, 'setup.py', '--quiet', 'sdist', '--dist-dir', folder, cwd=source,
+        env=own_variables(PYTHONWARNINGS='ignore'))
+    (file,) = folder.glob('*.tar.gz')
+    return file
+
+
+@pytest.fixture(scope='module')
+def wheel(sdist, tmp_path_factory):
+    """Build the wheel of the sdist alone, as packagers do, and open it."""
+    folder = tmp_path_factory.mktemp('wheel')
     # From this version on setuptools builds wheels by itself: nothing has to be fetched.
     able = Version(importlib.metadata.version('setuptools')) >= Version('70.1')
-    command = [sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps', '--wheel-dir',
-               str(built), *['--no-build-isolation'] * able, str(source)]
-    subprocess.run(command, check=True, timeout=120)
-    (file,) = built.glob('*.whl')
+    run(sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps', '--wheel-dir', folder,
+        *['--no-build-isolation'] * able, sdist, cwd=folder, env=own_variables())
+    (file,) = folder.glob('*.whl')
     with zipfile.ZipFile(file) as archive:
         yield archive
 
@@ -67,32 +118,29 @@ def metadata(wheel):
 
 
 @pytest.fixture(scope='module')
-def manifest():
-    return ElementTree.parse(ROOT / 'package.xml').getroot()
+def requirements(metadata):
+    """Return what the wheel says that it needs without ROS."""
+    needed = [Requirement(text) for text in metadata.get_all('Requires-Dist')]
+    return [str(requirement) for requirement in needed if requirement.marker is None]
 
 
-def test_package_xml_and_setup_py_say_the_same(metadata, manifest):
+def test_package_xml_and_setup_py_say_and_need_the_same(metadata, requirements):
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     maintainer = manifest.find('maintainer')
     assert manifest.findtext('name') == metadata['Name'].replace('-', '_')
     assert manifest.findtext('version') == metadata['Version']
     assert manifest.findtext('description') == metadata['Summary']
     assert metadata['Description-Content-Type'] == 'text/markdown'
     assert metadata.get_payload(decode=True) == (ROOT / 'README.md').read_bytes()
-    assert manifest.findtext('license') in (metadata['License'], metadata['License-Expression'])
-    assert maintainer.text == metadata['Maintainer']
+    assert manifest.findtext('license') == 'Apache-2.0'
+    assert 'Apache-2.0' in (metadata['License'], metadata['License-Expression'])
+    assert maintainer.text == metadata['Maintainer'] == 'l1slam_ros maintainers'
     assert maintainer.get('email') == metadata['Maintainer-email']
     assert manifest.findtext('export/build_type') == 'ament_python'
-
-
-def test_package_xml_and_setup_py_need_the_same(metadata, manifest):
     keys = {element.text for element in manifest.findall('exec_depend')}
-    key_of = {'pyyaml': 'python3-yaml'}
     only_of_pip = {'rosbags', 'mcap'}  # see test_release.py
-    for text in metadata.get_all('Requires-Dist'):
-        requirement = Requirement(text)
-        name = requirement.name.lower()
-        if requirement.marker is None and name not in only_of_pip:
-            assert key_of.get(name, f'python3-{name}') in keys, text
+    needed = {Requirement(text).name.lower() for text in requirements} - only_of_pip
+    assert {'python3-yaml' if name == 'pyyaml' else f'python3-{name}' for name in needed} <= keys
 
 
 def test_the_changelog_has_the_form_that_bloom_and_catkin_read(metadata):
@@ -110,45 +158,36 @@ def test_the_changelog_has_the_form_that_bloom_and_catkin_read(metadata):
         assert sections[0][0].split()[0] == metadata['Version']
 
 
-def test_the_licence_is_apache(wheel):
-    (name,) = [name for name in wheel.namelist() if name.endswith('/LICENSE')]
-    text = wheel.read(name).decode()
-    assert 'Apache License' in text and 'Version 2.0, January 2004' in text
-    assert text == (ROOT / 'LICENSE').read_text()
+def test_the_sdist_has_what_builds_the_package_and_nothing_else(sdist, source):
+    with tarfile.open(sdist) as archive:
+        names = {name.partition('/')[2] for name in archive.getnames()}
+    wanted = {'setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE', 'README.md',
+              'resource/l1slam_ros'}
+    for folder in ('config', 'launch', 'resource/run', 'l1slam_ros'):
+        wanted |= {str(path.relative_to(source)) for path in (source / folder).rglob('*')
+                   if path.is_file()}
+    assert wanted <= names, wanted - names
+    assert not {name.split('/')[0] for name in names} & {'bags', 'benchmarks', 'demo'}
 
 
-def test_every_module_is_in_the_wheel_and_no_test(wheel):
+def test_the_wheel_has_every_module_no_test_and_what_ros_looks_for(wheel):
+    names = wheel.namelist()
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / 'l1slam_ros').rglob('*.py')}
-    in_wheel = {name for name in wheel.namelist()
-                if name.endswith(('.py', 'py.typed')) and '.data/' not in name}
-    assert in_wheel == modules | {'l1slam_ros/py.typed'}
-    assert 'l1slam_ros/cli/report/page.html' in wheel.namelist()
-
-
-def test_every_folder_with_modules_is_a_package():
-    folders = {path.parent for path in (ROOT / 'l1slam_ros').rglob('*.py')}
-    assert all((folder / '__init__.py').is_file() for folder in folders)
-
-
-def test_ros_finds_the_data_files(wheel):
+    assert {name for name in names if name.endswith(('.py', 'py.typed'))
+            and '.data/' not in name} == modules | {'l1slam_ros/py.typed'}
+    assert 'l1slam_ros/cli/report/page.html' in names
+    (licence,) = [name for name in names if name.endswith('/LICENSE')]
+    assert wheel.read(licence) == (ROOT / 'LICENSE').read_bytes()
+    assert b'Version 2.0, January 2004' in wheel.read(licence)
     data = f'{stem(wheel)}.data/data/'
-    names = {name.removeprefix(data) for name in wheel.namelist() if name.startswith(data)}
-    shared = {f'share/l1slam_ros/{folder}/{path.name}' for folder in ('config', 'launch')
+    shared = {f'{data}share/l1slam_ros/{folder}/{path.name}' for folder in ('config', 'launch')
               for path in (ROOT / folder).iterdir() if path.is_file()}
-    assert 'share/ament_index/resource_index/packages/l1slam_ros' in names
-    assert 'share/l1slam_ros/package.xml' in names
-    assert shared <= names
-    assert {'share/l1slam_ros/config/backend.yaml',
-            'share/l1slam_ros/launch/backend.launch.py'} <= names
-
-
-def test_ros2_run_finds_executables(wheel):
-    folder = f'{stem(wheel)}.data/data/lib/l1slam_ros/'
-    starters = {info.filename.removeprefix(folder): info for info in wheel.infolist()
-                if info.filename.startswith(folder)}
+    assert shared | {f'{data}share/ament_index/resource_index/packages/l1slam_ros',
+                     f'{data}share/l1slam_ros/package.xml'} <= {*names}
+    starters = {info.filename.removeprefix(f'{data}lib/l1slam_ros/'): info
+                for info in wheel.infolist() if info.filename.startswith(f'{data}lib/')}
     assert starters.keys() == EXECUTABLES
-    for info in starters.values():
-        assert info.external_attr >> 16 & stat.S_IXUSR
+    assert all(info.external_attr >> 16 & stat.S_IXUSR for info in starters.values())
 
 
 @pytest.mark.parametrize('name', sorted(EXECUTABLES))
@@ -165,37 +204,151 @@ def test_a_starter_runs_the_executable_of_its_name(name, tmp_path):
     assert ran.returncode == 3
 
 
-def test_entry_points_exist(wheel):
-    pytest.importorskip('rclpy')
-    text = wheel.read(f'{stem(wheel)}.dist-info/entry_points.txt').decode()
-    entries = dict(re.findall(r'^(\w+) = (\S+)$', text, re.MULTILINE))
-    assert entries.keys() == EXECUTABLES
-    for entry in entries.values():
-        module, function = entry.split(':')
-        assert callable(getattr(importlib.import_module(module), function)), entry
-
-
 @pytest.mark.parametrize('name', ['backend', 'scan_loops', 'replay'])
-def test_what_needs_ros_says_so_in_one_line(name):
-    code = WITHOUT_ROS + f'import l1slam_ros.ros.executables as e; sys.exit(e.{name}())'
-    ran = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,
-                         timeout=60)
+def test_what_needs_ros_says_so_in_one_line(name, tmp_path):
+    ran = subprocess.run([Path(sysconfig.get_path('scripts')) / name], capture_output=True,
+                         env=without(tmp_path, *OF_ROS), text=True, timeout=PATIENCE)
     assert ran.returncode == 1 and ran.stderr.count('\n') == 1, ran.stderr
-    assert ran.stderr.startswith(f'{name}: ') and 'behind the wall; expected ROS 2' in ran.stderr
+    assert ran.stderr.startswith(f'{name}: ') and '; expected ROS 2' in ran.stderr
 
 
-def test_the_core_and_the_command_need_no_ros():
-    code = WITHOUT_ROS + """
-import importlib, pkgutil
-import l1slam_ros.cli.main, l1slam_ros.core, l1slam_ros.io
-for package in l1slam_ros.core, l1slam_ros.io:
-    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):
-        importlib.import_module(module.name)
-try:
-    import rclpy
-except ImportError:
-    print('walled')
+@contextmanager
+def running_backend(*command, cwd, env):
+    """Start a node that must become ready; end it by SIGTERM, upon which it must exit with 0."""
+    process = subprocess.Popen([*command], cwd=cwd, env=env, stderr=subprocess.PIPE, text=True)
+    try:
+        line = process.stderr.readline()
+        assert 'ready' in line, line
+        yield
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(PATIENCE) == 0
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_the_installed_wheel_runs(wheel, requirements, tmp_path):
+    """Where there is nothing but what it says that it needs; solving would compile."""
+    needed = environment(*requirements)
+    fresh = new_environment(tmp_path / 'fresh', sys.executable, below=needed)
+    fresh.install('--no-index', wheel.filename)
+    fresh.run('l1slam', 'simulate', 'bag', '--poses', 150, '--edges', 250, cwd=tmp_path)
+    fresh.run('l1slam', 'plot', 'bag', '--output', 'map.png', cwd=tmp_path)
+    assert (tmp_path / 'map.png').exists()
+    code = 'import l1slam_ros; print(l1slam_ros.__file__)'
+    assert Path(fresh.run('python', '-c', code, cwd=tmp_path)).is_relative_to(fresh.prefix)
+    pytest.importorskip('rclpy')
+    with running_backend(fresh.prefix / 'lib' / 'l1slam_ros' / 'backend', cwd=tmp_path,
+                         env=lent_variables(HOME=str(tmp_path))):
+        pass
+
+
+def lowest(requirement):
+    """Return the requirement for the lowest version that it allows."""
+    (bound,) = Requirement(requirement).specifier
+    return f'{Requirement(requirement).name}=={bound.version}.*'
+
+
+@pytest.mark.parametrize('version', ['3.10', '3.11', '3.12'])
+def test_every_python_comes_to_the_same_costs(wheel, requirements, version, tmp_path):
+    python = interpreter(version)
+    if python is None:
+        pytest.skip(f'no Python {version} on this machine')
+    # From 3.12 on there are no wheels of the lowest Matplotlib.
+    oldest = version == next(filter(interpreter, ['3.10', '3.11']), None)
+    if not oldest and version == f'{sys.version_info.major}.{sys.version_info.minor}':
+        pytest.skip('all other tests run on it')
+    needed = environment(*(map(lowest, requirements) if oldest else requirements), python=python)
+    fresh = new_environment(tmp_path / 'fresh', python, below=needed)
+    fresh.install('--no-index', wheel.filename)
+    found = json.loads(fresh.run('python', '-c', SMOKE, cwd=tmp_path))
+    assert found['python'] == version and not found['ros']
+    assert found['numpy'].startswith('1.26.' if oldest else '2.')
+    # Compilers order sums differently, and a solver stops within 10^-6 of the optimum.
+    (tmp_path / 'here').mkdir()
+    here = json.loads(run(sys.executable, '-c', SMOKE, cwd=tmp_path / 'here', env={**os.environ}))
+    assert found['costs'] == pytest.approx(here['costs'], rel=1e-6)
+
+
+@pytest.mark.parametrize('kind', ['editable', 'wheel'])
+def test_a_type_checker_finds_the_types_in_every_kind_of_install(wheel, source, kind, tmp_path):
+    """As `make` installs it, `--editable`, and as users do; strictly, and by a user's file."""
+    tools = environment('mypy~=2.4.1', 'numpy', 'setuptools>=70.1')
+    fresh = new_environment(tmp_path / 'fresh', sys.executable, below=tools)
+    if kind == 'editable':
+        copy = shutil.copytree(source, tmp_path / 'copy', symlinks=True)
+        fresh.install('--no-deps', '--no-build-isolation', '--editable', copy)
+    else:
+        fresh.install('--no-deps', '--no-index', wheel.filename)
+    example = re.search(r'## .*Python.*?```python\n(.*?)```', (ROOT / 'README.md').read_text(),
+                        re.S)[1]
+    (tmp_path / 'right.py').write_text(example)
+    (tmp_path / 'wrong.py').write_text(f'{example}\nl1.solve(3)\n')
+    found = subprocess.run(
+        [tools.python, '-m', 'mypy', '--strict', '--python-executable', fresh.python, 'right.py',
+         'wrong.py'], cwd=tmp_path, env=own_variables(), text=True, capture_output=True,
+        timeout=2 * PATIENCE)
+    wrong, *rest = found.stdout.splitlines()
+    assert wrong.startswith('wrong.py') and 'has incompatible type "int"' in wrong, found.stdout
+    assert 'Found 1 error in 1 file' in rest[-1]
+
+
+@pytest.fixture(scope='module', params=[[], ['--symlink-install']], ids=['plain', 'symlink'])
+def workspace(request, source, tmp_path_factory):
+    """Build a workspace by colcon; return it."""
+    folder = tmp_path_factory.mktemp('workspace')
+    shutil.copytree(source, folder / 'src' / 'l1slam_ros', symlinks=True)
+    # Setuptools warns where Python is told to write no bytecode.
+    built = environment(*COLCON).run('colcon', 'build', *request.param, cwd=folder,
+                                     HOME=str(folder), PYTHONDONTWRITEBYTECODE='')
+    # Were anything said on standard error, colcon would show it to its user and say so below.
+    assert re.search('Summary: 1 package finished.*\n$', built), built
+    return folder
+
+
+def test_colcon_tests_a_workspace(workspace, tmp_path):
+    """By a part of the suite, with what the running Python has."""
+    colcon = environment(*COLCON).prefix / 'bin' / 'colcon'
+    # These tests solve nothing, so there is nothing to compile for this place.
+    lent = lent_variables(HOME=str(tmp_path), NUMBA_DISABLE_JIT='1')
+    run(colcon, 'test', '--pytest-args', 'test/test_make.py', cwd=workspace, env=lent)
+    found = run(colcon, 'test-result', '--all', cwd=workspace, env=lent)
+    assert re.search(r'Summary: [1-9]\d* tests, 0 errors, 0 failures', found), found
+
+
+def sourced(workspace, *command):
+    """Return a command that sources the workspace, and then is `command`."""
+    return ['bash', '-c', '. "$0/install/setup.bash" && exec "$@"', workspace, *command]
+
+
+def test_a_sourced_workspace_runs_the_command(workspace, tmp_path):
+    lib = workspace / 'install' / 'l1slam_ros' / 'lib' / 'l1slam_ros'
+    assert {path.name for path in lib.iterdir()} == EXECUTABLES
+    out = run(*sourced(workspace, lib / 'l1slam', 'info', ROOT / 'bags' / 'demo'), cwd=tmp_path,
+              env=lent_variables())
+    assert 'poses       ' in out
+
+
+def test_a_sourced_workspace_is_found_by_ros_and_runs_the_node(workspace, tmp_path):
+    pytest.importorskip('rclpy')
+    code = """
+import ament_index_python as index, l1slam_ros
+print(index.get_package_prefix('l1slam_ros'))
+print(index.get_package_share_directory('l1slam_ros'))
+print(l1slam_ros.__file__)
 """
-    ran = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,
-                         timeout=60)
-    assert (ran.stdout, ran.stderr) == ('walled\n', '')
+    lent = lent_variables(HOME=str(tmp_path))
+    prefix, share, module = map(Path, run(
+        *sourced(workspace, environment(*COLCON).python, '-c', code), cwd=tmp_path,
+        env=lent).splitlines())
+    assert prefix == workspace / 'install' / 'l1slam_ros'
+    for path in ('package.xml', 'config/backend.yaml', 'launch/backend.launch.py'):
+        assert (share / path).read_bytes() == (ROOT / path).read_bytes()
+    assert module.is_relative_to(workspace)
+    lib = prefix / 'lib' / 'l1slam_ros'
+    command = sourced(workspace, lib / 'backend', '--ros-args', '--params-file',
+                      share / 'config' / 'backend.yaml')
+    with running_backend(*command, cwd=tmp_path, env=lent):
+        played = subprocess.run(sourced(workspace, lib / 'replay', 'no-such-bag'), cwd=tmp_path,
+                                env=lent, capture_output=True, text=True, timeout=PATIENCE)
+    assert played.returncode == 2 and 'no such file' in played.stderr

@@ -68,14 +68,10 @@ def test_equivalent_vertices_without_an_edge_have_one_pose(capsys, tmp_path):
         _, poses = l1.read_graph(solved)
         assert abs(poses[4, :2] - poses[0, :2]).max() < 1e-3
     assert report['warnings'][0].endswith('vouched for; 1 pair without an edge tied to each other')
+    (tmp_path / 'graph.g2o.struck.txt').write_text('0 4\n')  # a person may say otherwise
+    assert solve_json(capsys, written(tmp_path, [*SQUARE, 'EQUIV 0 4']))['rejected'] == [[0, 4]]
     written(tmp_path, [*SQUARE, 'EQUIV 4 7'])
     assert ':11: vertex 7 is unknown' in one_line(capsys, 'info', graph)
-
-
-def test_a_person_may_strike_out_equivalent_vertices(capsys, tmp_path):
-    graph = written(tmp_path, [*SQUARE, 'EQUIV 0 4'])
-    (tmp_path / 'graph.g2o.struck.txt').write_text('0 4\n')
-    assert solve_json(capsys, graph)['rejected'] == [[0, 4]]
 
 
 def test_lines_of_unknown_tags_are_counted_by_tag_in_one_line(capsys, tmp_path):
@@ -86,13 +82,6 @@ def test_lines_of_unknown_tags_are_counted_by_tag_in_one_line(capsys, tmp_path):
     assert sentence == (
         "5 lines not used: 1 'LASER_ROBOT_DATA', 2 'RGBD_DATA' (sensor data and calibration are "
         "no part of a pose graph); 1 'VERTEX_CAM', 1 'WIFI_DATA' (unknown tags)")
-
-
-@pytest.mark.parametrize('line', [
-    'EDGE_SE2_NEW 0 4 1', 'ODOMETRY 0 4 1 0 0', 'edge_se2 0 4', '3 4'])
-def test_what_ties_poses_is_never_left_out(capsys, tmp_path, line):
-    graph = written(tmp_path, [*SQUARE, line])
-    assert f':11: unknown tag {line.split()[0]!r}; expected' in one_line(capsys, 'solve', graph)
 
 
 @pytest.mark.parametrize('name', ['a.g2o.gz', 'a.toro.gz', 'a.g2o.bz2', 'a.jrl.gz'])
@@ -141,7 +130,9 @@ def test_edges_without_information_are_said_and_may_get_one(capsys, tmp_path):
     for path in tmp_path / 'made.g2o', full:
         assert 'EDGE_SE2 0 1 1.0 0.0 1.5708 25.0 0.0' in (
             path.read_text().replace(' 1 0 1.5708 25 0', ' 1.0 0.0 1.5708 25.0 0.0'))
-    run(capsys, 'plot', bare, full, '--output', tmp_path / 'maps.png', *given)
+    (tmp_path / 'in').mkdir()
+    written(tmp_path / 'in', bare.read_text().splitlines())
+    run(capsys, 'batch', tmp_path / 'in', '--output', tmp_path / 'results', *given)
     loops = written(tmp_path, ['EDGE_SE2 1:0 2:0 0 0 0'], 'between.txt')
     assert 'between.txt:1: EDGE_SE2: 5 fields, the information is missing' in one_line(
         capsys, 'merge', full, full, '--loops', loops, '--output', tmp_path / 'both.g2o')
@@ -162,15 +153,6 @@ def test_an_information_that_is_none_is_refused(capsys, tmp_path, value):
     assert f"argument --information: '{value}'; expected a number above 0" in said
     with pytest.raises(l1.L1SlamError, match='^information is '):
         l1.read_graph(tmp_path / 'graph.g2o', information=-1 if value == 'much' else float(value))
-
-
-def test_a_batch_passes_the_information_on(capsys, tmp_path):
-    pytest.importorskip('distributed')
-    (tmp_path / 'in').mkdir()
-    written(tmp_path / 'in', [*DRIVE, *STEPS, LOOP])
-    run(capsys, 'batch', tmp_path / 'in', '--output', tmp_path / 'out', '--information', '1',
-        '--workers', '1')
-    assert (tmp_path / 'out' / 'maps' / 'graph.g2o.g2o').exists()
 
 
 @pytest.mark.parametrize(('tag', 'other', 'whose'), [
@@ -195,8 +177,7 @@ def test_a_few_matrices_that_are_not_definite_do_not_turn_the_order(capsys, tmp_
 
 
 @pytest.mark.parametrize(('header', 'comma'), [
-    ('id x y theta', False), ('#id x y theta', False), ('"stamp","x","y","theta"', True),
-    ('timestamp, x, y, heading', True)])
+    ('#id x y theta', False), ('"stamp","x","y","theta"', True)])
 def test_a_truth_with_a_header_row_and_gaps_of_nan_is_read(capsys, tmp_path, header, comma):
     graph = written(tmp_path, SQUARE)
     (tmp_path / 'graph.g2o.stamps.txt').write_text(''.join(f'{k} {k}.0\n' for k in range(5)))
@@ -209,15 +190,9 @@ def test_a_truth_with_a_header_row_and_gaps_of_nan_is_read(capsys, tmp_path, hea
     assert report['ate_poses'] == (5 if comma else 4) and report['ate'] < 0.3
 
 
-def test_without_a_common_time_both_intervals_are_said(capsys, tmp_path):
-    graph = written(tmp_path, SQUARE)
-    (tmp_path / 'graph.g2o.stamps.txt').write_text(''.join(f'{k} 17{k}.5\n' for k in range(5)))
-    truth = written(tmp_path, [f'{k}.25 0 0 0 0 0 0 1' for k in range(20, 40)], 'truth.txt')
-    assert one_line(capsys, 'solve', graph, '--reference', truth).endswith(
-        'shares 0 poses with the graph, expected 2 or more; it has times from 20.250000000 to '
-        '39.250000000 s, the graph times from 170.500000000 to 174.500000000 s\n')
-    written(tmp_path, [f'{k} 0 0 0' for k in range(20, 40)], 'truth.txt')
-    assert one_line(capsys, 'solve', graph, '--reference', truth).endswith(
+def test_without_a_common_id_both_ranges_are_said(capsys, tmp_path):
+    truth = written(tmp_path, [f'{k} 0 0 0' for k in range(20, 40)], 'truth.txt')
+    assert one_line(capsys, 'solve', written(tmp_path, SQUARE), '--reference', truth).endswith(
         'it has ids from 20 to 39, the graph ids from 0 to 4\n')
 
 
@@ -226,11 +201,10 @@ def test_a_fifo_beside_a_graph_is_not_waited_for(capsys, tmp_path, name):
     graph = written(tmp_path, SQUARE)
     side = tmp_path / f'graph.g2o.{name}.txt'
     os.mkfifo(side)
-    if name == 'truth':
-        said = one_line(capsys, 'solve', graph, '--reference', side)
-    else:
-        said = one_line(capsys, 'plot', graph, '--output', tmp_path / 'map.png')
-    assert said == f'l1slam: {side}: cannot be read: it is not a regular file\n'
+    asked = ('solve', graph, '--reference', side) if name == 'truth' else (
+        'plot', graph, '--output', tmp_path / 'map.png')
+    assert one_line(capsys, *asked) == (
+        f'l1slam: {side}: cannot be read: it is not a regular file\n')
 
 
 @pytest.mark.parametrize('name', ['graph.g2o', 'graph.txt', 'graph.jrl', 'graph.g2o.gz', 'a.mcap',
@@ -266,8 +240,6 @@ def test_yaml_whose_aliases_expand_without_end_is_refused(capsys, tmp_path):
             capsys, 'solve', graph, '--params-file', params)
     params.write_text('/**:\n ros__parameters:\n  keyframe: {translation: &a 0.5, rotation: *a}\n')
     run(capsys, 'info', graph, '--params-file', params)
-    params.write_text('\n'.join(' ' * k + 'a:' for k in range(2000)))
-    assert 'nested too deeply' in one_line(capsys, 'solve', graph, '--params-file', params)
     params.unlink()
     os.mkfifo(params)
     assert 'not a regular file' in one_line(capsys, 'solve', graph, '--params-file', params)

@@ -12,13 +12,9 @@ import numpy as np
 import pytest
 from command import run, solve_json
 from rosbags.rosbag2 import StoragePlugin
-from worlds import graph_file, lines_of, pairs_of
 
 import l1slam_ros as l1
 from bags import NOTE, recording_of, rosbag2_directory
-
-EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
-         'EDGE_SE2 0 2 2.1 0 0 1 0 0 1 0 1']
 
 
 def copied_bag(bag, copy, names=None, note=NOTE):
@@ -108,20 +104,6 @@ def test_a_cut_bag_is_read_in_part_and_exits_with_3(capsys, world, tmp_path, soo
     assert out == '' and err.startswith(f'l1slam: {cut}') and err.count('\n') == 1
 
 
-@pytest.mark.parametrize('name', ['A.G2O', 'A.MCAP'])
-def test_a_suffix_may_be_in_capitals(capsys, world, tmp_path, name):
-    run(capsys, 'convert', world, tmp_path / 'bag')
-    if name == 'A.MCAP':
-        (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / name)
-    else:
-        run(capsys, 'convert', world, tmp_path / name)
-    run(capsys, 'convert', tmp_path / name, tmp_path / 'B.TUM')
-    found, expected = (np.sort(l1.read_graph(path)[0].between.measurement, axis=0)
-                       for path in (tmp_path / name, world))
-    np.testing.assert_allclose(found, expected, atol=1e-9)
-    assert np.loadtxt(tmp_path / 'B.TUM').shape == (150, 8)
-
-
 def test_a_trajectory_goes_out_as_tum_and_in_as_reference_with_stamps_that_others_round(
         capsys, world, tmp_path):
     output = tmp_path / 'out.tum'
@@ -146,10 +128,3 @@ def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_pa
     params.write_text('/**: {ros__parameters: {keyframe: {translation: 0.5}, solver: {norm: l2}}}')
     said = solve_json(capsys, tmp_path / 'bag', '--params-file', params)['final_cost']
     assert said == pytest.approx(solve_json(capsys, world, '--norm', 'l2')['final_cost'], rel=1e-6)
-
-
-def test_a_graph_in_parts_without_poses_is_converted_all_the_same(capsys, tmp_path):
-    path = graph_file(tmp_path, [*EDGES, EDGES[0].replace(' 0 1 ', ' 7 9 ', 1)])
-    run(capsys, 'convert', path, tmp_path / 'out.g2o')
-    assert not lines_of(tmp_path / 'out.g2o', 'VERTEX')
-    assert pairs_of(tmp_path / 'out.g2o') == [[0, 1], [1, 2], [0, 2], [7, 9]]

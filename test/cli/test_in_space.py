@@ -8,7 +8,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`l1slam` on worlds in space, and its norms: every command, in both readings of the rotation."""
 
-import numpy as np
 import pytest
 from command import run, solve_json
 
@@ -49,45 +48,3 @@ def test_each_norm_is_named_and_lowest_at_its_own_map(capsys, building, tmp_path
             there = solve_json(capsys, tmp_path / f'{other}.g2o', '--no-robust', '--norm', norm,
                            '--start', 'file', '--outer', 0)['final_cost']
             assert there >= costs[norm] * (1 - 1e-4)
-
-
-def test_the_reading_of_the_rotation_is_kept_and_weighs(capsys, building, tmp_path):
-    reading = ('--rotation-information', 'angle')
-    run(capsys, 'convert', building, tmp_path / 'same.g2o', *reading)
-    edges = [[line for line in path.read_text().splitlines() if line.startswith('EDGE')]
-             for path in (building, tmp_path / 'same.g2o')]
-    np.testing.assert_allclose(*([[float(v) for v in line.split()[1:]] for line in lines]
-                                 for lines in edges), rtol=1e-12)
-    costs = [solve_json(capsys, building, '--no-robust', '--norm', 'l2', *more)['final_cost']
-             for more in ((), reading)]
-    # The file is g2o's; read as of the angle its rotations weigh four times as much.
-    assert costs[1] > 1.5 * costs[0]
-
-
-@pytest.mark.parametrize('reading', ['quaternion', 'angle'])
-def test_information_that_is_not_definite_costs_one_line_and_no_map(capsys, building, reading):
-    """A third of the edges say of one direction that they know less than nothing of it."""
-    truth = ('--reference', f'{building}.truth.txt', '--rotation-information', reading)
-    clean = solve_json(capsys, building, *truth)
-    lines = building.read_text().splitlines()
-    upper = np.triu_indices(6)
-    count = 0
-    for k, line in enumerate(lines):
-        words = line.split()
-        if words[0] == 'EDGE_SE3:QUAT' and k % 3 == 0:
-            information = np.zeros((6, 6))
-            information[upper] = np.array(words[10:], float)
-            information = information + np.triu(information, 1).T
-            values, vectors = np.linalg.eigh(information)
-            values[count % 3] *= -1e-3
-            information = vectors @ np.diag(values) @ vectors.T
-            lines[k] = ' '.join([*words[:10], *map(repr, information[upper].tolist())])
-            count += 1
-    building.write_text('\n'.join(lines) + '\n')
-    report = solve_json(capsys, building, *truth, code=4)  # of so much noise it is not sure
-    warning, _ = report['warnings']
-    assert count > 100 and warning.startswith(f'{count} of 330 information matrices not positive ')
-    assert [doubt['kind'] for doubt in report['doubts']] == ['a weak map']
-    assert report['rejected'] == []
-    assert report['ate'] < 2 * clean['ate'] + 0.1
-    assert f'- {warning}\n' in run(capsys, 'info', building, *truth[2:])[0]

@@ -9,19 +9,14 @@
 """A map that was solved and written: drawn, listed and solved again as what was believed."""
 
 import json
-import math
 import re
 
 import numpy as np
 import pytest
-from command import run, solve_json
+from command import run, solve_json, texts_of
+from worlds import drifting, edited, made
 
 import l1slam_ros as l1
-
-
-def words(path):
-    """The texts of an SVG: matplotlib draws them as outlines and notes them in comments."""
-    return re.findall(r'<!-- (.*?) -->', path.read_text())
 
 
 def costs_of(texts):
@@ -30,31 +25,15 @@ def costs_of(texts):
             for cost in re.findall(r'(?:l1 cost:?|final) ([0-9.e+]+)', text.replace(',', ''))}
 
 
-def edited(path, change):
-    """Change the words of each edge of a g2o file, of odometry and of loops."""
-    lines = [line.split() for line in path.read_text().splitlines()]
-    for line in lines:
-        if line[0] == 'EDGE_SE2':
-            change(line, int(line[2]) == int(line[1]) + 1)
-    path.write_text('\n'.join(map(' '.join, lines)) + '\n')
-
-
-def drifting(line, is_odometry):
-    """Turn odometry by 20 mrad a metre."""
-    if is_odometry:
-        line[5] = repr(float(line[5]) + 0.02 * math.hypot(float(line[3]), float(line[4])))
-
-
 def of_the_identity(line, is_odometry):
     """State what nobody measured."""
     line[6:] = ['1', '0', '0', '1', '0', '1']
 
 
 @pytest.fixture(params=['false loops', 'drift', 'identity'])
-def world(request, capsys, tmp_path):
+def world(request, tmp_path):
     """Return a graph with ten false loops, by the kind of its odometry and information."""
-    path = tmp_path / 'world.g2o'
-    run(capsys, 'simulate', path, '--poses', 300, '--edges', 480, '--false-loops', 10)
+    path = made(tmp_path / 'world.g2o', 300, 480, '--false-loops', 10)
     if request.param == 'drift':
         edited(path, drifting)
     elif request.param == 'identity':
@@ -80,7 +59,7 @@ def test_a_solved_file_is_listed_drawn_and_solved_again_as_it_was_believed(
     assert 'loops are false' not in out
     run(capsys, 'plot', solved, '--output', tmp_path / 'solved.svg')
     assert (f'300 poses, 191 loops ({len(report["rejected"])} refused)'
-            in words(tmp_path / 'solved.svg'))
+            in texts_of(tmp_path / 'solved.svg'))
     after = solve_json(capsys, solved, '--output', again)
     assert [after[name] for name in ('rejected', 'suspect', 'slips', 'drift', 'doubts')] == [
         report[name] for name in ('rejected', 'suspect', 'slips', 'drift', 'doubts')]
@@ -112,7 +91,7 @@ def test_there_is_one_cost_in_text_json_picture_and_page(capsys, world, tmp_path
     final = float(re.search(r'final ([0-9.e+]+), without what is left out\n', out)[1])
     report = solve_json(capsys, world)
     assert float(f'{report["final_cost"]:.6g}') == final
-    assert costs_of(words(picture)) == {final}
+    assert costs_of(texts_of(picture)) == {final}
     pytest.importorskip('plotly')
     page = tmp_path / 'map.html'
     run(capsys, 'solve', world, '--quiet', '--report', page)

@@ -107,15 +107,8 @@ def test_a_view_in_the_place_of_messages_is_refused(capsys, tmp_path, query):
     assert_refused(capsys, bag, r'messages is a view; expected a table of rosbag2')
 
 
-def test_a_column_that_is_computed_is_refused(capsys, tmp_path):
-    bag = tmp_path / 'bomb.db3'
-    _database(bag, 'CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, '
-              'data AS (zeroblob(900000000)))', 'INSERT INTO messages VALUES (1, 1, 1)')
-    assert_refused(capsys, bag, 'messages is computed')
-
-
 @pytest.mark.parametrize('column', [
-    'data BLOB AS(zeroblob(900000000))', 'data BLOB AS\t(zeroblob(900000000)) STORED',
+    'data AS (zeroblob(900000000))', 'data BLOB AS\t(zeroblob(900000000)) STORED',
     '"data" BLOB GENERATED ALWAYS AS(zeroblob(900000000)) VIRTUAL'])
 def test_a_column_is_computed_however_that_is_spelled(tmp_path, capsys, column):
     bag = tmp_path / 'bomb.db3'
@@ -125,7 +118,7 @@ def test_a_column_is_computed_however_that_is_spelled(tmp_path, capsys, column):
               f'{column})',
               *(f'INSERT INTO messages VALUES ({k}, 1, {k})' for k in range(1, 30)))
     began = time.process_time()
-    assert 'messages is computed' in run(capsys, 'info', bag, code=2)[1]
+    assert_refused(capsys, bag, 'messages is computed')
     assert time.process_time() - began < 2
 
 
@@ -137,22 +130,22 @@ def test_a_view_in_the_place_of_the_schema_is_refused(tmp_path, capsys):
     assert 'schema is a view' in run(capsys, 'info', bag, code=2)[1]
 
 
-@pytest.mark.parametrize('indexed', [True, False])
-def test_the_name_of_a_topic_has_an_end(tmp_path, capsys, indexed):
-    mcap, sqlite = tmp_path / 'bomb.mcap', tmp_path / 'bomb.db3'
-    index = {} if indexed else {'index_types': IndexType.NONE, 'use_statistics': False,
-                                'repeat_channels': False, 'use_summary_offsets': False}
-    with mcap.open('wb') as stream:
-        writer = Writer(stream, compression=CompressionType.ZSTD, **index)
-        writer.start('ros2')
-        channel = writer.register_channel('/a' * 10**6, 'cdr', writer.register_schema(
-            _ODOM[1], 'ros2msg', b''))
-        writer.add_message(channel, 1, b'', 1)
-        writer.finish()
-    _database(sqlite, 'CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data)',
+def test_the_name_of_a_topic_has_an_end(tmp_path, capsys):
+    bags = [tmp_path / name for name in ('indexed.mcap', 'plain.mcap', 'bomb.db3')]
+    index = {'index_types': IndexType.NONE, 'use_statistics': False, 'repeat_channels': False,
+             'use_summary_offsets': False}
+    for bag, options in zip(bags[:2], ({}, index), strict=True):
+        with bag.open('wb') as stream:
+            writer = Writer(stream, compression=CompressionType.ZSTD, **options)
+            writer.start('ros2')
+            channel = writer.register_channel('/a' * 10**6, 'cdr', writer.register_schema(
+                _ODOM[1], 'ros2msg', b''))
+            writer.add_message(channel, 1, b'', 1)
+            writer.finish()
+    _database(bags[2], 'CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data)',
               "UPDATE topics SET name = '/' || hex(zeroblob(1000000))",
               "INSERT INTO messages VALUES (1, 1, 1, x'00')")
-    for bag in mcap, sqlite:
+    for bag in bags:
         said = run(capsys, 'info', bag, code=2)[1]
         assert 'characters; expected at most 1,024' in said and len(said) < 500
 
@@ -164,11 +157,8 @@ def test_a_blob_of_gigabytes_is_refused(capsys, tmp_path):
     assert_refused(capsys, bag, 'a message of 256 MiB')
 
 
-def _nested():
-    return {'brackets': '[' * 10000, 'lists': '- ' * 10000 + 'x', 'keys': '? ' * 5000 + 'x'}
-
-
-@pytest.mark.parametrize('text', _nested().values(), ids=_nested())
+@pytest.mark.parametrize('text', ['[' * 10000, '- ' * 10000 + 'x', '? ' * 5000 + 'x'],
+                         ids=['brackets', 'lists', 'keys'])
 def test_nested_yaml_is_refused_at_once(capsys, tmp_path, text):
     bag, params, graph = (tmp_path / name for name in ('bag', 'params.yaml', 'a.g2o'))
     bag.mkdir()
@@ -194,7 +184,11 @@ def test_a_compressed_file_that_unpacks_to_gigabytes_is_refused(capsys, tmp_path
 
 
 def test_a_line_of_gigabytes_is_refused_before_it_is_read(tmp_path):
-    graph = tmp_path / 'bomb.g2o'
+    graph, comment = tmp_path / 'bomb.g2o', '# ' + 'x' * 60000
+    # Lines across blocks are read whole.
+    graph.write_text('\n'.join(
+        comment if k % 3 else f'EDGE_SE2 {k} {k + 3} 1 0 0 1 0 0 1 0 1' for k in range(87)))
+    assert l1.read_graph(graph)[0].n_poses == 30
     with graph.open('wb') as file:
         file.write(b'VERTEX_SE2 0 0 0 0\n# ')
         file.truncate(2**30)  # zeros that take no room on the disk
@@ -206,15 +200,6 @@ def test_a_line_of_gigabytes_is_refused_before_it_is_read(tmp_path):
     with pytest.raises(l1.L1SlamError, match='expected a text file of at most'):
         l1.read_graph(graph)
     assert time.process_time() - began < 2
-
-
-def test_lines_across_blocks_are_read_whole(tmp_path):
-    graph = tmp_path / 'long.g2o'
-    comment = '# ' + 'x' * 60000
-    lines = [comment if k % 3 else f'VERTEX_SE2 {k} 0 0 0' for k in range(90)]
-    lines += [f'EDGE_SE2 {k} {k + 3} 1 0 0 1 0 0 1 0 1' for k in range(0, 87, 3)]
-    graph.write_text('\n'.join(lines))
-    assert l1.read_graph(graph)[0].n_poses == 30
 
 
 def test_a_bomb_costs_the_command_no_memory(tmp_path):

@@ -139,7 +139,7 @@ def test_every_message_before_a_cut_is_used_and_no_other(
     name, whole, ends = kind(tmp_path, recording)
     assert len(ends) == len(recording) and sorted(ends) == ends
     path = tmp_path / f'cut_{name}'
-    for cut in [*rng.integers(0, len(whole), 20), len(whole) - 10]:
+    for cut in [*rng.integers(0, len(whole), 12), len(whole) - 10]:
         path.write_bytes(whole[:cut])
         expected = int(np.searchsorted(ends, cut, 'right'))
         try:
@@ -150,12 +150,7 @@ def test_every_message_before_a_cut_is_used_and_no_other(
         assert found == expected
         assert_told(said, path, expected)
         assert f': it breaks off after {cut:,} bytes; ' in said
-
-
-def test_damage_is_a_warning_in_python(tmp_path, bag):
-    path = tmp_path / 'a.mcap'
-    path.write_bytes((bag / 'bag.mcap').read_bytes()[:8000])
-    with pytest.warns(UserWarning, match='a.mcap is damaged: it breaks off after 8,000 b'):
+    with pytest.warns(UserWarning, match=' is damaged: it breaks off after '):  # in Python
         l1.read_graph(path)
 
 
@@ -197,7 +192,7 @@ def test_wherever_a_bit_of_our_bag_is_wrong_no_message_is(tmp_path, read_part, r
     whole = (bag / 'bag.mcap').read_bytes()
     path = tmp_path / 'a.mcap'
     told = 0
-    for at in rng.integers(0, len(whole), 60):
+    for at in rng.integers(0, len(whole), 24):
         damaged = bytearray(whole)
         damaged[at] ^= 1 << rng.integers(8)
         path.write_bytes(damaged)
@@ -205,7 +200,7 @@ def test_wherever_a_bit_of_our_bag_is_wrong_no_message_is(tmp_path, read_part, r
             found, said = read_part(path, recording=recording, whole=of_bag)
             assert said or found == len(recording)
             told += bool(said)
-    assert told > 15
+    assert told > 6
 
 
 def test_a_record_that_swallows_the_rest_of_a_chunk_is_damage(tmp_path, read_part, recording):
@@ -254,22 +249,21 @@ def test_a_split_bag_is_used_up_to_the_damage(tmp_path, read_part, recording, pl
     folder = split_directory(tmp_path / 'a', recording, plugin, mode, parts=12)
     files = sorted(folder.glob('a_*'), key=lambda file: int(re.findall('[0-9]+', file.name)[0]))
     size = -(-len(recording) // 12)
-    files[11].write_bytes(files[11].read_bytes()[:-4000])
+    whole = files[11].read_bytes()
+    files[11].write_bytes(whole[:-4000])
     found, said = read_part(folder)
     assert found >= 11 * size
     assert said.startswith(f'{files[11]} is damaged: ')
+    listed = (folder / 'metadata.yaml').read_text()
     (folder / 'metadata.yaml').unlink()
     assert read_part(folder) == (found, said)
     files[10].unlink()
     assert same(folder, recording[:10 * size] + recording[11 * size:found])
-
-
-def test_a_missing_file_of_a_split_bag(tmp_path, recording):
-    folder = split_directory(tmp_path / 'a', recording, StoragePlugin.MCAP)
-    size = -(-len(recording) // 3)
-    (folder / 'a_1.mcap').unlink()
-    left = recording[:size] + recording[2 * size:]
-    assert same(folder, left) == (f'{folder / "a_1.mcap"} is damaged: the file is missing; '
+    # The last one is whole: what is before and after the missing one is used.
+    files[11].write_bytes(whole)
+    (folder / 'metadata.yaml').write_text(listed)
+    left = recording[:10 * size] + recording[11 * size:]
+    assert same(folder, left) == (f'{files[10]} is damaged: the file is missing; '
                                   f'{len(left)} messages before and after that were used')
 
 
@@ -353,7 +347,7 @@ def small(tmp_path_factory):
 
 @pytest.mark.parametrize('name', ['ours.mcap', 'lz4.mcap', 'unchunked.mcap', 'rosbag2.db3',
                                   'ros1.bag', 'bag/metadata.yaml'])
-@settings(max_examples=40, derandomize=True, deadline=None, database=None,
+@settings(max_examples=25, derandomize=True, deadline=None, database=None,
           suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(pieces=st.lists(PIECES, min_size=1, max_size=3))
 def test_no_bytes_make_a_traceback_or_half_a_file(tmp_path, small, capfd, name, pieces):

@@ -13,6 +13,7 @@ import pytest
 from command import run
 from numpy.testing import assert_allclose
 from records import beside, error_of, information_of, read
+from worlds import as_map, lines_of, made
 
 import l1slam_ros as l1
 
@@ -62,17 +63,22 @@ def test_edges_alone_name_the_vertices(write):
     assert record.graph.between.i.tolist() == [1]
 
 
-def test_priors_are_seen_from_the_world(write):
-    graph = read(write(
+def test_priors_are_seen_from_the_world(write, tmp_path):
+    record = read(write(
         'EDGE_PRIOR_SE2 7 1 2 0.5 10 1 2 20 3 30\n' + SQUARE + 'EDGE_PRIOR_SE2_XY 9 3 4 5 1 6\n'
-        'EDGE_PRIOR_SE2 3 0 0 1 0 0 0 0 0 9\n')).graph
-    factors = graph.between
+        'EDGE_PRIOR_SE2 3 0 0 1 0 0 0 0 0 9\n'))
+    graph, factors = record.graph, record.graph.between
     assert factors.is_absolute.tolist() == [True, False, False, False, True, True]
     assert factors.j[factors.is_absolute].tolist() == [1, 2, 0]
     assert factors.measurement[factors.is_absolute].tolist() == [[1, 2, 0.5], [3, 4, 0], [0, 0, 1]]
     np.testing.assert_allclose(information_of(graph)[factors.is_absolute], [
         [[10, 1, 2], [1, 20, 3], [2, 3, 30]], [[5, 1, 0], [1, 6, 0], [0, 0, 0]],
         np.diag([0, 0, 9])], rtol=1e-15)
+    record.write(tmp_path / 'again.g2o')
+    assert_same(record, read(tmp_path / 'again.g2o'))
+    tags = [line.split()[0] for line in (tmp_path / 'again.g2o').read_text().splitlines()]
+    assert [tag for tag in tags if tag.startswith('EDGE')] == [
+        'EDGE_PRIOR_SE2', *['EDGE_SE2'] * 3, 'EDGE_PRIOR_SE2_XY', 'EDGE_PRIOR_SE2']
 
 
 def test_what_is_not_used_is_said(write):
@@ -109,11 +115,8 @@ def test_the_same_square_in_toro(write):
     ('EDGE_SE2 3 7 1 0 0 -2 1 0 -3 0 -1',
      'information [-2 1 0 1 -3 0 0 0 -1]; expected a positive definite matrix'),
     ('EDGE_PRIOR_SE2 3 1 0 0 -1 0 0 -1 0 -1', 'information [-1 0 0 0 -1 0 0 0 -1]; expected'),
-    ('EDGE_PRIOR_SE2_XY 3 1 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected'),
-    ('EDGE_SE2 3 7 1 0 0 0 0 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected a positive'),
     ('EDGE_PRIOR_SE2_XY 3 1 0 0 1 0 1', 'EDGE_PRIOR_SE2_XY: 7 fields; expected 1 whole and 5'),
     ('EDGE_PRIOR_SE2 -1 1 0 0 1 0 0 1 0 1', 'vertex -1 is unknown; expected one of the 3'),
-    ('EDGE_PRIOR_SE2 3 7 1 0 0 1 0 0 1 0 1', 'EDGE_PRIOR_SE2: 11 fields; expected 1 whole and 9'),
 ])
 def test_an_edge_that_cannot_be_used_is_told(write, line, message):
     assert message_of(write(SQUARE + line + '\n')).startswith(f':9: {message}')
@@ -197,45 +200,12 @@ def test_no_file_and_a_directory(capsys, tmp_path):
     assert message_of(graph) == '.stamps.txt: cannot be read: Is a directory'
 
 
-def triangle(information):
-    return information[np.triu_indices(3)].tolist()
-
-
-def write_random(path, rng, n=40, stamped=True):
-    """Write a graph of random numbers as others do; return ids, stamps, poses, measurements."""
-    ids = np.sort(rng.choice(10**12, n, replace=False))
-    ids[-2:] = 2**63 - 2, 2**63 - 1  # as floats they would be one
-    poses = rng.normal(size=(n, 3)) * 1e3
-    poses[0, :2] = 1e30, -1e30
-    stamps = 2**62 + np.cumsum(rng.integers(1, 10**12, n))
-    i = np.concatenate((np.arange(n - 1), rng.integers(0, n - 5, 60)))
-    j = np.concatenate((np.arange(1, n), i[n - 1:] + rng.integers(1, 5, 60)))
-    A = rng.normal(size=(len(i), 3, 3))
-    information = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(3)
-    measured = rng.normal(size=(len(i), 3))
-    lines = [('VERTEX_SE2', *row) for row in zip(ids.tolist(), *poses.T.tolist(), strict=True)]
-    lines += [('EDGE_SE2', ids[a], ids[b], *z, *triangle(W)) for a, b, z, W in zip(
-        i, j, measured.tolist(), information, strict=True)]
-    for k, z, diagonal in ((3, (1.5, 2, 3), (7.7, 7.7, 7.7)), (9, (-1, 2, 0.5), (2, 3, 0)),
-                           (7, (0, 1 / 3, -2), (0, 3, 7))):
-        lines.append(('EDGE_PRIOR_SE2', ids[k], *z, *triangle(np.diag(diagonal))))
-    lines.insert(-2, ('EDGE_PRIOR_SE2_XY', ids[3], 1 / 7, 2, 2, 0, 3))
-    lines.append(('EDGE_SE2', ids[1], ids[9], 1, 1 / 9, 2, *triangle(np.diag([0, 0.1, 0]))))
-    path.write_text('\n'.join(' '.join(map(str, line)) for line in lines) + '\n')
-    if stamped:
-        beside(path, 'stamps').write_text(''.join(
-            f'{k} {stamp // 10**9}.{stamp % 10**9:09}\n'
-            for k, stamp in zip(ids.tolist(), stamps.tolist(), strict=True)))
-    return ids, stamps, poses, measured
-
-
 @pytest.fixture
-def source(tmp_path, rng):
-    """Return a folder, and a graph file of random numbers that is not in it."""
+def source(tmp_path):
+    """Return a folder, and a graph file with stamps and 61 loops that is not in it."""
     (tmp_path / 'source').mkdir()
     (tmp_path / 'out').mkdir()
-    write_random(tmp_path / 'source' / 'b.g2o', rng)
-    return tmp_path / 'out', tmp_path / 'source' / 'b.g2o'
+    return tmp_path / 'out', as_map(made(tmp_path / 'source' / 'b.g2o', 40, 100))
 
 
 def assert_same(a, b):
@@ -266,31 +236,13 @@ def test_edges_from_a_vertex_to_itself_are_left_out(tmp_path, suffix, tag, infor
     assert message_of(path).startswith(': no edges; expected')
 
 
-def test_round_trip(tmp_path, rng):
-    path, source = tmp_path / 'a.g2o', tmp_path / 'source' / 'b.g2o'
-    source.parent.mkdir()
-    ids, stamps, poses, measured = write_random(source, rng)
-    record = read(source)
-    record.write(path)
-    back = read(path)
-    assert_same(record, back)
-    assert (back.ids == ids).all() and (back.poses == poses).all()
-    assert (back.graph.between.measurement[:len(measured)] == measured).all()
-    assert (back.stamps == stamps).all()
-    tags = [line.split()[0] for line in path.read_text().splitlines()[:-1]]
-    prior = 'EDGE_PRIOR_SE2'
-    assert tags[-5:] == [prior, f'{prior}_XY', prior, prior, 'EDGE_SE2']
-    assert {p.name for p in tmp_path.iterdir()} == {'a.g2o', 'a.g2o.stamps.txt', 'source'}
-
-
-@pytest.mark.parametrize('name', ['intel', 'manhattan3500', 'city10000'])
+@pytest.mark.parametrize('name', ['intel', 'manhattan3500'])
 def test_the_papers_graphs_come_back_number_by_number(datasets, tmp_path, name):
     source, copy = datasets / f'{name}.g2o', tmp_path / 'copy.g2o'
     read(source).write(copy)
 
     def rows(path, tag):
-        lines = [line.split() for line in path.read_text().splitlines()]
-        return [[float(v) for v in line[1:]] for line in lines if line and line[0] == tag]
+        return [[float(v) for v in row] for row in lines_of(path, tag)]
 
     assert rows(copy, 'VERTEX_SE2') == sorted(rows(source, 'VERTEX_SE2'))
     assert rows(copy, 'EDGE_SE2') == rows(source, 'EDGE_SE2')
@@ -300,11 +252,12 @@ def test_trust_and_strikes_come_back_with_the_graph(source):
     folder, file = source
     path, record = folder / 'a.g2o', read(file)
     factors, ids = record.graph.between, record.ids
-    pairs = np.stack((factors.i, factors.j), axis=1)
-    rows = [row for row in range(len(factors) - 1, 39, -7)  # loops that nothing runs along
+    pairs = factors.pairs
+    odometry, loops = np.flatnonzero(factors.is_odometry), np.flatnonzero(~factors.is_odometry)
+    rows = [row for row in loops[::-7].tolist()  # loops that nothing runs along
             if (pairs == pairs[row]).all(axis=1).sum() == 1]
     assert len(rows) > 3
-    record.graph.say(np.array([0, *rows]), trusted=True)  # row 0 is odometry
+    record.graph.say(np.array([odometry[0], *rows]), trusted=True)
     struck = rows.pop()
     record.graph.say(np.array([struck]), trusted=False)
     record.write(path)
@@ -382,7 +335,7 @@ def test_graph_stamps_and_trust_are_replaced_together_or_not_at_all(source):
     beside(path, 'trusted').mkdir()
     before = contents(folder)
     stamps = beside(file, 'stamps')
-    stamps.write_text(stamps.read_text().replace(' 46', ' 45'))
+    stamps.write_text(stamps.read_text().replace(' 40.', ' 41.'))
     plain, other = read(file), read(file)
     other.graph.say(np.array([50]), trusted=True)
     for changed, word in (other, 'written'), (plain, 'removed'):

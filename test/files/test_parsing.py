@@ -32,8 +32,8 @@ def parsed(tmp_path):
 
 
 @pytest.mark.parametrize('texts', [
-    ALIKE, [text.replace(' ', '  ') for text in ALIKE], [f'{text} ' for text in ALIKE],
-    [text.replace(' ', '\t') for text in ALIKE], ALIKE[:1], [f'{text} # ours' for text in ALIKE],
+    ALIKE, [text.replace(' ', '  ') for text in ALIKE], ALIKE[:1],
+    [f'{text} # ours' for text in ALIKE],
     [ALIKE[0], '2 3 .2 0 0 +400 0 0 400 0 1e4', ALIKE[2]]])
 def test_lines_that_end_alike_read_as_any_others(parsed, texts):
     ids, measured, information = parsed(texts)
@@ -42,18 +42,10 @@ def test_lines_that_end_alike_read_as_any_others(parsed, texts):
     np.testing.assert_allclose(information, [np.diag([400, 400, 1e4])] * len(texts), rtol=1e-15)
 
 
-def test_of_lines_that_are_all_alike_the_whole_numbers_are_read(parsed):
-    ids, measured, information = parsed(['7 8 7 7 7 7 0 0 7 0 7'] * 3)
-    assert ids.tolist() == [[7, 8]] * 3 and measured.tolist() == [[7, 7, 7]] * 3
-    np.testing.assert_allclose(information, [7 * np.eye(3)] * 3, rtol=1e-15)
-
-
 @pytest.mark.parametrize(('middle', 'found'), [
-    (f'2 3 # .2 {END}', '2 fields'), (f'2 3 .2 # {END}', '3 fields'),
-    (f'2 3 .2 1 {END}', '12 fields'), (f'2 3 {END}', '10 fields'),
-    (f'2 3 x {END}', "'x' is not a finite number"), (f'2 3 nan {END}', "'nan'"),
-    (f'2 3.5 .2 {END}', "'3.5' is not a whole number"), (f'2 3 .2 1{END}x', "'1e4x'"),
-    (f'2 3 .21{END}', '10 fields'), (END, '8 fields')])
+    (f'2 3 # .2 {END}', '2 fields'), (f'2 3 .2 1 {END}', '12 fields'),
+    (f'2 3 x {END}', "'x' is not a finite number"), (f'2 3.5 .2 {END}', "'3.5' is not a whole"),
+    (f'2 3 .2 1{END}x', "'1e4x'"), (END, '8 fields')])
 def test_a_malformed_line_among_lines_that_end_alike_is_named(parsed, middle, found):
     with pytest.raises(l1.L1SlamError, match=f'a.g2o:2: EDGE_SE2: {found}'):
         parsed([ALIKE[0], middle, ALIKE[2]])

@@ -11,45 +11,33 @@
 import numpy as np
 import pytest
 from laps import LAP, Laps, late
+from messages import TYPES, header, odometry, of_rosbags, pose_with_covariance
 from numpy.testing import assert_array_equal
 from problems import hear
 from records import read
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin
 
 import l1slam_ros as l1
-from bags import TYPES
-
-_KINDS = {'/odom': 'nav_msgs/msg/Odometry',
-          '/loop_closures': 'geometry_msgs/msg/PoseWithCovarianceStamped'}
+from bags import rosbag2_directory
 
 
 def write(path, found):
     """Write samples and loops in the order they come, by a writer that is not ours."""
-    T = TYPES.types
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topics = {name: writer.add_connection(name, kind, typestore=TYPES)
-                  for name, kind in _KINDS.items()}
-        for k, one in enumerate(found):
-            frame, topic = 'odom', '/odom'
-            if isinstance(one, l1.LoopClosure):
-                time = '{}.{:09}'.format(*divmod(one.reference_stamp, 10**9))
-                frame, topic = f'b@{time}', '/loop_closures'
-            x, y, z, qx, qy, qz, qw = one.pose3.tolist()
-            pose = T['geometry_msgs/msg/PoseWithCovariance'](
-                T['geometry_msgs/msg/Pose'](T['geometry_msgs/msg/Point'](x, y, z),
-                                            T['geometry_msgs/msg/Quaternion'](qx, qy, qz, qw)),
-                one.covariance.ravel())
-            header = T['std_msgs/msg/Header'](
-                T['builtin_interfaces/msg/Time'](*divmod(one.stamp, 10**9)), frame)
-            message = T[_KINDS[topic]](header, pose) if topic != '/odom' else T[_KINDS[topic]](
-                header, 'b', pose, _twist(T))
-            writer.write(topics[topic], 10**18 + k, TYPES.serialize_cdr(message, _KINDS[topic]))
-
-
-def _twist(T):
-    none = T['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
-    return T['geometry_msgs/msg/TwistWithCovariance'](
-        T['geometry_msgs/msg/Twist'](none, none), np.zeros(36))
+    recording = []
+    for k, one in enumerate(found):
+        stamp, pose3 = divmod(one.stamp, 10**9), one.pose3.tolist()
+        covariance = one.covariance.ravel()
+        if isinstance(one, l1.LoopClosure):
+            name, kind = '/loop_closures', 'geometry_msgs/msg/PoseWithCovarianceStamped'
+            frame = 'base_link@{}.{:09}'.format(*divmod(one.reference_stamp, 10**9))
+            pose = pose_with_covariance(of_rosbags, pose3[:3], pose3[3:], covariance=covariance)
+            message = of_rosbags(kind, header=header(of_rosbags, *stamp, frame), pose=pose)
+        else:
+            name, kind = '/odom', 'nav_msgs/msg/Odometry'
+            message = odometry(of_rosbags, header(of_rosbags, *stamp), position=pose3[:3],
+                               quaternion=pose3[3:], covariance=covariance)
+        recording.append((name, kind, 10**18 + k, bytes(TYPES.serialize_cdr(message, kind))))
+    rosbag2_directory(path, recording, StoragePlugin.MCAP, note=None)
 
 
 @pytest.mark.parametrize('fault', ['restart', 'silence', 'disorder'])

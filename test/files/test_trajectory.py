@@ -59,13 +59,6 @@ def columns(path):
     return rows
 
 
-def test_invented_stamps_are_ten_a_second_from_1000_s(tmp_path):
-    record = read(graph_of(tmp_path / 'a.g2o', POSES))
-    record.write(tmp_path / 'a.tum')
-    assert [row[0] for row in columns(tmp_path / 'a.tum')] == [
-        '1000.000000000', '1000.100000000', '1000.200000000']
-
-
 def test_a_tum_file_has_eight_columns_and_exact_stamps(tmp_path):
     path, source = tmp_path / 'a.tum', tmp_path / 'a.g2o'
     source.write_text('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n')
@@ -78,6 +71,10 @@ def test_a_tum_file_has_eight_columns_and_exact_stamps(tmp_path):
         np.array(rows, float)[:, 1:],
         [[1.25, -2, 0, 0, 0, 0, 1], [0.1, 0.2, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]], rtol=1e-15)
     assert [len(row) for row in rows] == [8, 8]
+    # Stamps that are invented are ten a second from 1000 s on.
+    beside(source, 'stamps').unlink()
+    read(source).write(tmp_path / 'b.tum')
+    assert [row[0] for row in columns(tmp_path / 'b.tum')] == ['1000.000000000', '1000.100000000']
 
 
 def test_tum_of_other_tools(capsys, tmp_path):
@@ -97,14 +94,8 @@ def test_truth_round_trip(capsys, tmp_path):
     assert [line[0] for line in lines] == list(map(str, range(40)))
     graph, _ = l1.read_graph(path)
     l1.write_graph(back, graph, np.array(lines, float)[:, 1:])
-    assert_same_reference(capsys, path, truth, back)
-
-
-def assert_same_reference(capsys, graph, *references):
-    """Check that some references give the same error, as far as it is printed."""
-    errors = [solve_json(capsys, graph, '--reference', one, code=None)['ate']
-              for one in references]
-    assert errors == [errors[0]] * len(errors) and errors[0] > 0
+    errors = [solve_json(capsys, path, '--reference', one)['ate'] for one in (truth, back)]
+    assert errors[0] == errors[1] > 0
 
 
 def test_the_vertices_of_a_graph_file_are_a_reference(capsys, tmp_path):
@@ -119,8 +110,9 @@ def test_a_graph_with_stamps_is_a_reference_by_them_where_both_have_some(capsys,
     beside(path, 'stamps').write_text('14 10.5\n12 11\n19 12\n')
     assert_positions(capsys, tmp_path, path, (10.5, 11, 12))
     graph = graph_of(tmp_path / 'b.g2o', POSES)
-    assert 'shares 0 poses with the graph' in run(
-        capsys, 'solve', graph, '--reference', path, code=2)[1]
+    for reference, said in ((path, 'shares 0 poses with the graph'),
+                            (tmp_path / 'none', 'cannot be read: No such file or directory')):
+        assert said in run(capsys, 'solve', graph, '--reference', reference, code=2)[1]
 
 
 @pytest.mark.parametrize('text', [
@@ -137,20 +129,16 @@ def test_a_csv_file_has_stamps(capsys, tmp_path, text):
     ('1 2 3\n', ':1: 3 columns; expected 8 (TUM), 4 (id and pose) or a graph file'),
     ('0 0 0 0\n1 0 0\n', ':2: pose: 3 fields; expected 1 whole and 3 finite numbers'),
     ('0 0 0 0\n1 0 0 inf\n', ":2: pose: 'inf' is not a finite number; expected"),
-    ('0 0 0 0\n1.5 0 0 0\n', ":2: pose: '1.5' is not a whole number of 64 bits; expected"),
     ('0 0 0 0\n1 0 0 0\n# c\n0 0 0 0\n', ':4: the same id or stamp a second time; expected'),
     ('1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1\n', ':2: TUM pose: 7 fields; expected'),
     ('1 0 0 0 0 0 0 1\nnow 0 0 0 0 0 0 1\n', ":2: stamp 'now'; expected seconds"),
-    ('1 0 0 0 0 0 0 1\n-2 0 0 0 0 0 0 1\n', ":2: stamp '-2'; expected seconds"),
     ('1 0 0 0 0 0 0 1\n2 0 inf 0 0 0 0 1\n', ":2: TUM pose: 'inf' is not a finite number"),
     ('1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n', ':2: quaternion [0.0, 0.0, 0.0, 0.0]; expected one of'),
     ('1 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n', ':2: the same id or stamp a second time'),
     ('1,2,3\n', ':1: 3 columns; expected 8 (TUM) or 4 (stamp and pose)'),
     ('stamp, x, y, theta\n', ':1: 0 columns; expected 8 (TUM) or 4 (stamp and pose)'),
     ('1,0,0,0\n2,0,x,0\n', ":2: pose: 'x' is not a finite number"),
-    ('1,0,0,0\ninf,0,0,0\n', ":2: stamp 'inf'; expected seconds"),
     ('0 nan 0 0\n', ': 1 true pose of 1 left out: NaN; expected reference poses'),
-    ('7\n', ':1: 1 column; expected 8 (TUM), 4 (id and pose) or a graph file'),
     ('VERTEX_SE2 0 0 0\n', ':1: VERTEX_SE2: 3 fields; expected'),
     ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n', ': no vertices; expected VERTEX_SE2, VERTEX2, '),
 ])
@@ -158,9 +146,3 @@ def test_each_malformed_reference_is_named(capsys, tmp_path, text, message):
     graph, path = graph_of(tmp_path / 'graph.g2o', POSES), write(tmp_path, text)
     said = run(capsys, 'solve', graph, '--reference', path, code=2)[1]
     assert said.startswith(f'l1slam: {path}{message}') and said.count('\n') == 1
-
-
-def test_no_reference(capsys, tmp_path):
-    graph = graph_of(tmp_path / 'graph.g2o', POSES)
-    said = run(capsys, 'solve', graph, '--reference', tmp_path / 'none.txt', code=2)[1]
-    assert 'cannot be read: No such file or directory' in said
