@@ -32,7 +32,8 @@ def graph_of(capsys, tmp_path):
     """Return what gives stamps [ns] and poses of the keyframes of a log, and what is said."""
     def graph(path, lines=None, code=0):
         if lines is not None:
-            path.write_text('\n'.join(['# CARMEN Logfile', 'ODOM 0 0 0 0 0 0 1 host 0', *lines, '']))
+            begin = '# CARMEN Logfile', 'ODOM 0 0 0 0 0 0 1 host 0'
+            path.write_text('\n'.join([*begin, *lines, '']))
         err = run(capsys, 'convert', path, tmp_path / 'out.g2o', code=code)[1]
         if code == 2:
             return err
