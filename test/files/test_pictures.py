@@ -159,12 +159,3 @@ def test_the_suffix_decides(capsys, name, start, tmp_path):
     assert len(list(tmp_path.iterdir())) == 1 + (start is not None)
     if name == 'map.svg':  # a name is written as it is
         assert '$\\frac$.g2o' in texts_of(tmp_path / name)
-
-
-def test_what_cannot_be_written_is_said_and_leaves_nothing(capsys, tmp_path):
-    path = graph(tmp_path / 'a.g2o')
-    (tmp_path / 'taken.png').mkdir()
-    for picture in tmp_path / 'missing' / 'map.png', tmp_path / 'taken.png':
-        err = run(capsys, 'plot', path, '--output', picture, '--force', code=2)[1]
-        assert err.startswith(f'l1slam: {picture}: ') and err.count('\n') == 1
-    assert {one.name for one in tmp_path.iterdir()} == {'a.g2o', 'taken.png'}

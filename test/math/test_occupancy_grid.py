@@ -9,7 +9,6 @@
 """An occupancy grid against the cells that each ray passes, found by its crossings of lines."""
 
 import numpy as np
-import pytest
 from rooms import scan_at
 
 from l1slam_ros.core.scans.occupancy.grid import draw
@@ -59,10 +58,3 @@ def test_each_ray_tells_the_cells_it_passes_and_the_one_it_ends_in():
 
 def test_of_nothing_there_is_a_grid_of_nothing():
     assert (draw([], np.zeros((0, 3))).occupancy == -1).all()
-
-
-def test_the_grid_of_a_laser_that_sees_nothing_is_a_free_disk():
-    points = points_of(scan_at(np.zeros(3), np.random.default_rng(0), farthest=0.06))
-    occupancy = draw([points] * 3, np.zeros((3, 3))).occupancy
-    assert not (occupancy == 100).any()
-    assert (occupancy == 0).sum() * 0.05**2 == pytest.approx(np.pi * OPEN**2, rel=0.05)
