@@ -98,8 +98,9 @@ def places(path):
     return [(word, float(x), float(y)) for word, x, y in found]
 
 
-@pytest.mark.parametrize('shape', SHAPES)
-@pytest.mark.parametrize('command', ['one', 'three', 'solve'])
+@pytest.mark.parametrize('command, shape', [
+    *(('one', shape) for shape in SHAPES), ('three', SHAPES[1]), ('solve', SHAPES[0]),
+    ('solve', SHAPES[2])])
 def test_whatever_the_shape_the_legend_is_in_order_below_the_axis_and_no_number_over_another(
         capsys, tmp_path, shape, command):
     path, picture = graph(tmp_path / 'a.g2o', shape, [(0, 4)]), tmp_path / 'map.svg'
