@@ -12,19 +12,16 @@ import os
 import shutil
 import sqlite3
 
-import numpy as np
 import yaml
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
+from records import read
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
-
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.bags.from_graph import write_graph_bag
-from l1slam_ros.io.graphs.graph_file import GraphRecord
+from worlds import simulated_bag
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 NOTE = '{keyframes: every, covariance: increment}'
@@ -32,11 +29,8 @@ STRING, NOTED = 'std_msgs/msg/String', yaml.safe_load(NOTE)
 
 
 def write_world(path, poses, edges, seed=0):
-    """Write a simulated world as a bag of this package; return what was written."""
-    world = simulate_world(poses, edges, WorldOptions(), np.random.default_rng(seed))
-    record = GraphRecord(world.graph, world.odometry, np.arange(poses))
-    write_graph_bag(path, record)
-    return record
+    """Write a simulated world as a bag of this package; return what is read of it."""
+    return read(simulated_bag(path, poses, edges, '--seed', seed))
 
 
 def recording_of(bag):

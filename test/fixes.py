@@ -11,10 +11,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from problems import add_absolute
+from worlds import compose
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+import l1slam_ros as l1
 
 # Where the map frame is to the first keyframe: far off, and turned.
 FRAME = (100.0, -40.0, 2.0)
@@ -28,7 +27,7 @@ class SeenWorld:
     truth : (n, 3) in the map frame; false : the keyframes whose positions are far off, ascending.
     """
 
-    graph: FactorGraph
+    graph: l1.FactorGraph
     truth: np.ndarray
     false: np.ndarray
 
@@ -40,13 +39,13 @@ class SeenWorld:
 
 def seen(graph, truth, every, rng, part_false=0.0, sigma=1.0, off=50.0):
     """Return the odometry of a graph, seen from above; sigma [m] of x and of y."""
-    truth = se2.compose(np.broadcast_to(FRAME, truth.shape), truth)
+    truth = compose(np.array(FRAME), truth)
     graph = graph.subset(graph.between.is_odometry)
     k = np.arange(0, graph.n_poses, every)
     position = truth[k, :2] + sigma * rng.standard_normal((len(k), 2))
     bad = np.sort(rng.permutation(len(k))[:round(part_false * len(k))])
     angle = rng.uniform(0, 2 * np.pi, len(bad))
     position[bad] += off * np.stack((np.cos(angle), np.sin(angle)), axis=1)
-    add_absolute(graph, k, np.insert(position, 2, 0.0, axis=1),
-                 np.tile(np.diag([sigma**-2, sigma**-2, 0]), (len(k), 1, 1)))
+    graph.add_between(np.full_like(k, -1), k, np.insert(position, 2, 0.0, axis=1),
+                      np.tile(np.diag([sigma**-2, sigma**-2, 0]), (len(k), 1, 1)))
     return SeenWorld(graph, truth, k[bad])

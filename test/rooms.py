@@ -8,12 +8,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot with a laser that drives round a block in a room, and what it records."""
 
+from contextlib import redirect_stderr
+from dataclasses import dataclass
+from io import StringIO
+
 import numpy as np
+from records import read
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from worlds import between, compose, wrapped
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.scans.points import Scan
+from l1slam_ros.cli.main import main
 
 # Walls, from x y to x y [m]: the room, a block in it, and what tells one corner from another.
 WALLS = np.array([
@@ -25,6 +30,19 @@ _CORNERS = np.array([(1.5, 1.5), (10.5, 1.5), (10.5, 6.5), (1.5, 6.5)])
 _STEP = 0.15
 _PERIOD = 0.2
 _RAYS = 240
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One turn of a laser, as sensor_msgs/msg/LaserScan has it; stamp [ns]."""
+
+    stamp: int
+    ranges: np.ndarray
+    angle_min: float
+    angle_increment: float
+    range_min: float = 0.0
+    range_max: float = np.inf
+    time_increment: float = 0.0
 
 
 def box(x, y, u, v):
@@ -48,7 +66,7 @@ def ranges_on_the_way(pose, velocity, period, rng, walls=WALLS, noise=0.01):
     """Return what it measures while it turns once from a pose on, at a steady velocity, (r,)."""
     seconds = period * np.arange(_RAYS) / _RAYS
     steps = seconds[:, None] * velocity
-    poses = se2.compose(np.broadcast_to(pose, steps.shape), steps)
+    poses = compose(pose, steps)
     angles = poses[:, 2] + 2 * np.pi * np.arange(_RAYS) / _RAYS
     return _cast(poses[:, :2], angles, walls) + noise * rng.standard_normal(_RAYS)
 
@@ -76,7 +94,7 @@ def along(corners, step=_STEP):
         d = np.subtract(b, a)
         heading = np.arctan2(d[1], d[0])
         if last is not None:
-            turn = se2.wrap(heading - last)
+            turn = -wrapped(last - heading)
             count = int(np.ceil(abs(turn) / 0.3))
             poses += [(*a, last + turn * k / count) for k in range(1, count)]
         length = np.hypot(*d)
@@ -87,27 +105,33 @@ def along(corners, step=_STEP):
 
 def drifting(true, rng):
     """Return the wheels of a robot that was at poses (n, 3): they drift to the left."""
-    steps = se2.between(true[:-1], true[1:])
+    steps = between(true[:-1], true[1:])
     steps[:, 2] += 0.02 * np.hypot(steps[:, 0], steps[:, 1]) + 0.002 * rng.standard_normal(
         len(steps))
-    wheels = se2.identity(len(true))
-    for k, step in enumerate(steps):
-        wheels[k + 1] = se2.compose(wheels[k][None], step[None])[0]
-    return wheels
+    return driven(steps)
 
 
-def drive(true, seed=0, walls=WALLS, spoil=None, noise=0.01):
+def driven(steps, start=(0.0, 0.0, 0.0)):
+    """Return the poses (n + 1, 3) of wheels that make steps (n, 3)."""
+    poses = [np.array(start)]
+    for step in steps:
+        poses.append(compose(poses[-1], step))
+    return np.array(poses)
+
+
+def drive(true, seed=0, walls=WALLS, spoil=None, noise=0.01, period=_PERIOD):
     """
     Return scans and the wheels' poses of a robot that is at poses (n, 3).
 
     spoil : takes ranges, the number of the scan and the generator, returns other ranges
+    period : from one scan to the next [s]
     """
     rng = np.random.default_rng(seed)
     wheels = drifting(true, rng)
     scans = []
     for k, pose in enumerate(true):
         ranges = ranges_at(pose, rng, walls, noise)
-        scans.append(Scan(1000 * 10**9 + k * int(_PERIOD * 1e9),
+        scans.append(Scan(1000 * 10**9 + k * int(period * 1e9),
                           ranges if spoil is None else spoil(ranges, k, rng), 0.0,
                           2 * np.pi / _RAYS, 0.05, 30.0))
     return scans, wheels
@@ -204,8 +228,61 @@ def write_scan_bag(path, scans, wheels, mount=None, again=0):
                 scan.time_increment, 0.2, scan.range_min, scan.range_max,
                 scan.ranges.astype(np.float32), np.zeros(0, np.float32)))
             if k + 1 < len(scans):
-                between = se2.interpolate(wheels[k][None], wheels[k + 1][None], np.array([0.5]))[0]
-                put('/wheels', now + 10**8, odometry(scan.stamp + 10**8, between))
+                halfway = compose(pose, 0.5 * between(pose, wheels[k + 1]))
+                put('/wheels', now + 10**8, odometry(scan.stamp + 10**8, halfway))
+
+
+def write_whole_log(path, scans, wheels):
+    """Write all that a laser in the middle of the robot has seen as a CARMEN log."""
+    lines = []
+    for scan, pose in zip(scans, wheels.tolist(), strict=True):
+        robot, ranges = ' '.join(map(repr, pose)), ' '.join(map(repr, scan.ranges.tolist()))
+        lines.append(f'ROBOTLASER1 0 0 {2 * np.pi} {scan.angle_increment!r} 30 0.01 0 '
+                     f'{len(scan.ranges)} {ranges} 0 {robot} {robot} 0 0 0 0 0 '
+                     f'{scan.stamp / 1e9:.6f} host 0')
+    path.write_text('\n'.join(lines) + '\n')
+
+
+class FrontEndGraph:
+    """
+    The graph that the scan front end makes of a drive, which nobody has judged or solved.
+
+    graph, poses : see `l1.read_graph`; rows : the number of the scan of each keyframe; said : the
+    sentences on standard error; parts : of the drive, between which there is no odometry
+    """
+
+    def __init__(self, folder, scans, wheels):
+        log, graph, said = folder / 'drive.log', folder / 'graph.g2o', StringIO()
+        write_whole_log(log, scans, wheels)
+        with redirect_stderr(said):
+            assert main(['convert', str(log), str(graph)]) == 0
+        found = read(graph)
+        self.said = [line.removeprefix('l1slam: ') for line in said.getvalue().splitlines()]
+        self.graph, self.poses = found.graph, found.poses
+        self.rows = np.searchsorted([scan.stamp for scan in scans], found.stamps)
+        self.odometry = found.graph.between.is_odometry
+        self.loops = found.graph.between.pairs[~self.odometry]
+        self.parts = self.graph.n_poses - int(self.odometry.sum())
+
+    def way(self):
+        """Return the poses by odometry, from the first one, (n, 3); there is one part."""
+        assert self.parts == 1
+        return driven(self.graph.between.measurement[self.odometry])
+
+    def off(self, true):
+        """Return how far the way is off where the robot was at true poses (n, 3), (k, 3)."""
+        true = true[self.rows]
+        return self.way() - between(true[:1], true)
+
+    def errors(self, true):
+        """Return the errors of all factors, (m, 3) in the axes of their ends."""
+        factors, true = self.graph.between, true[self.rows]
+        return between(factors.measurement, between(true[factors.i], true[factors.j]))
+
+    def covariances(self):
+        """Return the covariances that factors state, (m, 3, 3)."""
+        root = self.graph.between.sqrt_information
+        return np.linalg.inv(root.transpose(0, 2, 1) @ root)
 
 
 def write_truth(path, scans, true):

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Pose graphs of other front ends, in their own messages: from bags, and by the node's reader."""
+"""Pose graphs of other front ends, in their own messages: from bags."""
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from pose_graphs import (
     MAP_GRAPH,
     ODOM,
     PRIOR,
+    REJECTED,
     SECOND,
     SIGMA,
     VIRTUAL,
@@ -27,6 +28,7 @@ from pose_graphs import (
     edge,
     growing,
     link,
+    map_graph,
     pose_graph,
     write,
 )
@@ -78,6 +80,39 @@ def test_who_listens_late_knows_the_time_of_the_newest_alone(tmp_path, truth):
                   loop_topic='/graph')
     assert record.graph.between.is_odometry.all()
     assert record.skipped[0].startswith('1 message refused: a loop of keyframe 1, whose stamp no')
+
+
+def test_a_front_end_that_begins_anew_has_its_numbers_again(tmp_path, truth):
+    """A keyframe of unknown time is never given that of another with its number."""
+    late = growing(truth, [])[-1]
+    anew = [map_graph(100 + k, range(1, k + 2), []) for k in range(5)]
+    closing = [link(6, 3, GLOBAL, truth), link(6, 1, GLOBAL, truth)]
+    record = read(write(tmp_path / 'bag', [
+        *driven(truth), ('/graph', 15, late), *driven(truth, 100.0),
+        *(('/graph', 100 + k, graph) for k, graph in enumerate(anew)),
+        ('/graph', 105, map_graph(105, range(1, 7), closing))]), loop_topic='/graph')
+    loops = record.graph.between.pairs[~record.graph.between.is_odometry]
+    assert (record.stamps[loops] // SECOND).tolist() == [[102, 105]]
+    assert any(one.startswith('1 message refused: a loop of keyframe 1, whose stamp no')
+               for one in record.skipped)
+
+
+def test_a_pose_graph_tells_the_times_and_whose_they_are(tmp_path, truth):
+    """The second message adds to the first; another robot's graph is not ours."""
+    unset = np.full((6, 6), -1.0)
+    graphs = [pose_graph(20, [(k, 10.0 + k) for k in range(1, 7)], [
+        edge(1, 2, ODOM, truth), edge(1, 5, LOOPCLOSE, truth),
+        edge(2, 6, LOOPCLOSE, truth, unset), edge(1, 4, REJECTED, truth),
+        edge(3, 6, LOOPCLOSE, truth, robots=(0, 1))]),
+        pose_graph(21, [], [edge(6, 3, LOOPCLOSE, truth)]),
+        pose_graph(22, [(9, 30.0)], [edge(1, 6, LOOPCLOSE, truth, robots=(1, 1))], 1)]
+    record = read(write(tmp_path / 'bag', [*driven(truth, 11.0), *(
+        ('/graph', 20 + k, graph) for k, graph in enumerate(graphs))]), loop_topic='/graph')
+    rows = ~record.graph.between.is_odometry
+    pairs = record.graph.between.pairs[rows].tolist()
+    assert sorted(pairs) == [[0, 4], [1, 5], [2, 5]]
+    stated = information_of(record.graph)[rows][pairs.index([0, 4])]
+    assert np.allclose(np.linalg.inv(stated), COVARIANCE[np.ix_((0, 1, 5), (0, 1, 5))])
 
 
 @pytest.fixture

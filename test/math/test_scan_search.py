@@ -11,11 +11,15 @@
 import numpy as np
 import pytest
 from rooms import WALLS, box, scan_at
+from scipy.spatial import KDTree
+from worlds import between
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.scans.field import CERTAIN, RESOLUTION, Field
+from l1slam_ros.core.scans.field import Field
 from l1slam_ros.core.scans.points import points_of
-from l1slam_ros.core.scans.search import TURN, search
+from l1slam_ros.core.scans.search import search
+
+# [m] Cells and how far the look-up reaches; [rad] from one turn to the next; a likelihood of 1.
+RESOLUTION, REACH, TURN, CERTAIN = 0.1, 0.6, 0.025, 255
 
 HERE = np.array([1.5, 1.5, 0.3])
 
@@ -24,12 +28,27 @@ def surface(pose, walls=WALLS, seed=0):
     return points_of(scan_at(pose, np.random.default_rng(seed), walls)).surface
 
 
+def test_what_is_looked_up_is_the_nearest_point():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(-3, 4, (120, 2))
+    field = Field.of(xy, np.ones_like(xy))
+    a, b = field.nearest.shape
+    centres = field.origin + RESOLUTION * (np.stack(
+        np.meshgrid(np.arange(a), np.arange(b), indexing='ij'), axis=2) + 0.5)
+    distance, nearest = KDTree(xy).query(centres)
+    near = distance < REACH - 1e-9
+    assert (field.nearest[near] == nearest[near]).all()
+    assert (field.nearest[distance > REACH + 1e-9] == -1).all()
+    expected = np.where(near, np.exp(-distance**2 / (2 * RESOLUTION**2)), 0)
+    assert np.allclose(field.likelihood / CERTAIN, expected, atol=0.5 / CERTAIN + 1e-6)
+
+
 @pytest.mark.parametrize('there', [(2.2, 1.1, 2.0), (3.0, 1.2, -1.5), (1.0, 2.0, 0.3)])
 def test_a_scan_is_found_from_far(there):
     field = Field.of(*surface(HERE))
-    expected = se2.between(HERE[None], np.array([there]))[0]
+    expected = between(HERE, np.array(there))
     peak = search(field, surface(there, seed=1)[0], np.array([1.5, -1, 0]), 4.0, np.pi, 0.3, 0.85)
-    off = se2.between(expected[None], peak.pose[None])[0]
+    off = between(expected, peak.pose)
     assert np.hypot(*off[:2]) < 1.5 * RESOLUTION and abs(off[2]) < 1.5 * TURN
     assert peak.second < 0.85 * peak.score
 

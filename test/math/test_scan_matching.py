@@ -11,8 +11,8 @@
 import numpy as np
 import pytest
 from rooms import WALLS, box, scan_at
+from worlds import compose
 
-from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.scans.field import Field
 from l1slam_ros.core.scans.matching import match
 from l1slam_ros.core.scans.points import points_of
@@ -34,7 +34,7 @@ def surface(pose, rng, walls=WALLS, noise=0.01, farthest=30.0):
 @pytest.mark.parametrize(('noise', 'off'), [(0.0, 2e-3), (0.01, 6e-3)])
 def test_a_known_motion_comes_back_to_millimetres(rng, motion, noise, off):
     field = Field.of(*surface(HERE, rng, noise=noise))
-    there = se2.compose(HERE[None], np.array([motion]))[0]
+    there = compose(HERE, np.array(motion))
     found = match(field, *surface(there, rng, noise=noise), np.zeros(3))
     assert found.pose == pytest.approx(motion, abs=off)
     assert found.matched > 0.8 and found.curvature > 0.05
@@ -67,15 +67,6 @@ def test_what_noisy_normals_say_along_a_corridor_is_nothing(seed):
     sigma = np.sqrt(np.diag(np.linalg.inv(found.information + W)))
     assert found.pose == pytest.approx((1.0, 0.0, 0.0), abs=0.02)
     assert sigma[0] == pytest.approx(0.4, abs=0.02) and (sigma[1:] < 0.05).all()
-
-
-def test_along_a_corridor_the_wheels_are_believed(rng):
-    field = Field.of(*surface(np.zeros(3), rng, CORRIDOR, farthest=8.0))
-    wheels = np.array([0.3, 0.05, 0.02])
-    found = match(field, *surface(np.array([0.3, 0, 0]), rng, CORRIDOR, farthest=8.0), wheels,
-                  wheels, np.diag(1 / np.array([0.05, 0.05, 0.05]) ** 2))
-    assert found.pose[0] == pytest.approx(0.3, abs=0.03)
-    assert found.pose[1:] == pytest.approx([0, 0], abs=6e-3)
 
 
 def test_where_nothing_matches_nothing_is_claimed(rng):
