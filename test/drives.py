@@ -1,0 +1,184 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""What a robot says on the way, for `l1.Backend`, and what that makes of it."""
+
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from records import information_of
+from worlds import false_of, made, truth_of
+
+import l1slam_ros as l1
+
+# Every message a keyframe, with the covariance it states: the graph is that of the messages.
+EVERY_MESSAGE = {'keyframe': {'translation': 0.0, 'rotation': 0.0, 'period': 0.0},
+                 'odometry': {'covariance_source': 'increment'}}
+EVERY = l1.BackendOptions.from_mapping(EVERY_MESSAGE)
+# Every loop is used, however far off.
+CREDULOUS = l1.BackendOptions.from_mapping({**EVERY_MESSAGE, 'robust': {'enabled': False}})
+PERIOD = 0.1  # [s] from one keyframe to the next
+PLENTY = 60.0  # [s] of budget: an update then ends by its own tests, on any machine
+STATES = ('waiting', 'suspect', 'accepted', 'rejected', 'expired')
+_NOTHING = np.zeros((6, 6))
+
+
+@dataclass(frozen=True)
+class World:
+    """A graph, its true poses (n, p), and the keyframes of its false loops."""
+
+    graph: l1.FactorGraph
+    truth: np.ndarray
+    false: set
+
+    def is_false(self, stamps):
+        """Tell which loops of these stamps (l, 2) are false."""
+        pairs = np.round(stamps / seconds(PERIOD)).astype(int).tolist()
+        return np.array([tuple(pair) in self.false for pair in pairs], bool)
+
+
+def simulated(folder, poses, edges, *more):
+    """Return a world of `l1slam simulate`."""
+    path = made(folder / 'world.g2o', poses, edges, *more)
+    false = {tuple(sorted(pair)) for pair in false_of(path)} if '--false-loops' in more else set()
+    return World(l1.read_graph(path)[0], truth_of(path), false)
+
+
+def careful(world):
+    """Return the world with half the noise of rotations in its odometry, which states that."""
+    manifold, factors = world.graph.manifold, world.graph.between
+    exact = manifold.between(world.truth[factors.i], world.truth[factors.j])
+    noise, information = manifold.local(exact, factors.measurement), information_of(world.graph)
+    rows, turn = factors.is_odometry, slice(-1 if noise.shape[1] == 3 else -3, None)
+    noise[rows, turn] /= 2
+    information[rows, turn, turn] *= 4
+    return World(remeasured(world.graph, manifold.retract(exact, noise), information),
+                 world.truth, world.false)
+
+
+def remeasured(graph, measurement, information=None):
+    """Return the graph with other measurements (m, p) and information (m, d, d), if any."""
+    other = l1.FactorGraph(graph.manifold, graph.n_poses)
+    other.add_between(graph.between.i, graph.between.j, measurement,
+                      information_of(graph) if information is None else information)
+    return other
+
+
+def turning(graph, drift):
+    """Return a graph in the plane whose odometry turns by so much more each metre [rad/m]."""
+    rows, measurement = graph.between.is_odometry, graph.between.measurement.copy()
+    measurement[rows, 2] += drift * np.hypot(*measurement[rows, :2].T)
+    return remeasured(graph, measurement)
+
+
+def odometry_of(graph):
+    """Return the poses of the odometry alone, (n, p), each robot's from the identity."""
+    poses, step_to = graph.manifold.identity(graph.n_poses), graph.between.step_to
+    for k in np.flatnonzero(step_to >= 0).tolist():
+        poses[k] = graph.manifold.compose(
+            poses[graph.predecessor[k]], graph.between.measurement[step_to[k]])
+    return poses
+
+
+def covariances_of(graph):
+    """Return the covariances of all factors as messages state them, (m, 6, 6)."""
+    rows = np.array([0, 1, 5]) if graph.manifold.TANGENT_SIZE == 3 else np.arange(6)
+    whole = np.zeros((len(graph.between), 6, 6))
+    whole[:, rows[:, None], rows] = np.linalg.inv(information_of(graph))
+    return whole
+
+
+def seconds(value):
+    """Return a stamp [ns]."""
+    return round(value * 1e9)
+
+
+def covariance6(covariance):
+    """Return the covariance of a message whose x, y, yaw have this one, (3, 3)."""
+    whole = np.zeros((6, 6))
+    whole[np.ix_((0, 1, 5), (0, 1, 5))] = covariance
+    return whole
+
+
+def pose3(pose):
+    """Return a pose x, y, theta as x y z qx qy qz qw."""
+    x, y, theta = pose
+    return np.array([x, y, 0.0, 0.0, 0.0, np.sin(theta / 2), np.cos(theta / 2)])
+
+
+def odometry(time, pose, covariance=_NOTHING):
+    """Return the sample of a robot at x, y, theta; time : [s]."""
+    return l1.OdometrySample(seconds(time), pose3(pose), covariance, _NOTHING)
+
+
+def loop(reference_time, time, pose, covariance=_NOTHING, **more):
+    """Return the loop that saw the robot at x, y, theta; times : [s]."""
+    return l1.LoopClosure(seconds(reference_time), seconds(time), pose3(pose), covariance, **more)
+
+
+def drive(backend, first, last, step=1.0):
+    """Drive straight ahead: keyframe k at k `step` [m] and k [s]."""
+    for k in range(first, last):
+        backend.add_odometry(odometry(k, (k * step, 0.0, 0.0), covariance6(1e-4 * np.eye(3))))
+
+
+def messages(graph, first=0, last=None):
+    """Yield the sample of each keyframe first to last of a graph, and the loops that end there."""
+    factors, manifold, covariances = graph.between, graph.manifold, covariances_of(graph)
+    poses = manifold.to_pose3(odometry_of(graph))
+    measured, loops = manifold.to_pose3(factors.measurement), ~factors.is_odometry
+    for k in islice(range(graph.n_poses), first, last):
+        step = factors.step_to[k]
+        yield l1.OdometrySample(seconds(k * PERIOD), poses[k],
+                                covariances[step] if step >= 0 else _NOTHING, _NOTHING)
+        for row in np.flatnonzero(loops & (factors.j == k)):
+            yield l1.LoopClosure(seconds(factors.i[row] * PERIOD), seconds(k * PERIOD),
+                                 measured[row], covariances[row])
+
+
+def hear(backend, found, robot=0):
+    """Add samples and loops."""
+    for message in found:
+        if isinstance(message, l1.LoopClosure):
+            backend.add_loop(message)
+        else:
+            backend.add_odometry(message, robot)
+
+
+def play(backend, graph, first=0, last=None):
+    """Add keyframes first to last of a graph and the loops that end there."""
+    hear(backend, messages(graph, first, last))
+
+
+def played(graph, first=0, last=None, options=EVERY):
+    """Return a back end that has heard of some keyframes of a graph."""
+    backend = l1.Backend(options, 2 if graph.manifold.TANGENT_SIZE == 3 else 3)
+    play(backend, graph, first, last)
+    return backend
+
+
+def settled(backend):
+    """Update until there is nothing left to do; return how often."""
+    for count in range(100):
+        if backend.update(PLENTY) is None:
+            return count
+    raise AssertionError('a hundred updates of one graph did not settle')
+
+
+def states(backend):
+    """Return what has become of loops by their stamps [s]: {(reference, end): state}."""
+    found = backend.loop_states()
+    return {tuple(stamps): STATES[state] for stamps, state in zip(
+        (found.stamps / 1e9).tolist(), found.state.tolist(), strict=True)}
+
+
+def in_state(backend, state):
+    """Return the stamps [ns] of the loops in a state, (l, 2)."""
+    found = backend.loop_states()
+    return found.stamps[found.state == STATES.index(state)]

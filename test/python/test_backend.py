@@ -1,0 +1,334 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""The back end of one robot: as good as a batch solve, in time, and consistent on the way."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drives import (
+    CREDULOUS,
+    EVERY,
+    EVERY_MESSAGE,
+    PERIOD,
+    PLENTY,
+    drive,
+    in_state,
+    loop,
+    odometry,
+    odometry_of,
+    play,
+    played,
+    seconds,
+    settled,
+    simulated,
+    states,
+)
+from numpy.testing import assert_allclose, assert_array_equal
+from records import information_of
+from worlds import between, compose, whitened
+
+import l1slam_ros as l1
+
+
+@pytest.fixture(scope='module')
+def graph(tmp_path_factory):
+    return simulated(tmp_path_factory.mktemp('world'), 150, 320, '--seed', 1).graph
+
+
+@pytest.fixture(scope='module')
+def best(graph):
+    """The least cost there is."""
+    return l1.solve(graph, robust=False).cost
+
+
+def cost(graph, poses):
+    return np.abs(whitened(graph, poses)).sum()
+
+
+def test_played_back_the_graph_is_that_of_the_world(graph):
+    found = played(graph).snapshot().graph
+    assert_array_equal(found.between.pairs[np.lexsort(found.between.pairs.T)],
+                       graph.between.pairs[np.lexsort(graph.between.pairs.T)])
+    assert_allclose(odometry_of(found), odometry_of(graph), atol=1e-6)
+    assert_allclose(*(information_of(one).sum(axis=0) for one in (found, graph)),
+                    rtol=1e-6, atol=1e-6)
+
+
+def test_incremental_ends_at_the_cost_of_batch(graph, best):
+    """Within 2 parts in 10,000; on the way each update ends within 1%."""
+    with l1.Backend(EVERY) as backend:
+        for k in range(0, 150, 10):
+            play(backend, graph, k, k + 10)
+            improvement = backend.update(PLENTY)
+            assert improvement.cost <= improvement.cost_before
+            if k in (40, 90, 140):
+                now = backend.snapshot().graph
+                batch = l1.solve(now, robust=False)
+                assert cost(now, backend.poses) == pytest.approx(batch.cost, rel=1e-2)
+        settled(backend)
+        assert cost(graph, backend.poses) == pytest.approx(best, rel=2e-4)
+
+
+@pytest.mark.parametrize('options', [EVERY, CREDULOUS], ids=['robust', 'credulous'])
+def test_settled_the_map_is_the_optimum_and_all_loops_are_judged(graph, best, options):
+    with l1.Backend(options) as backend:
+        assert backend.settle() is None
+        play(backend, graph)
+        found = backend.settle()
+        assert found.cost == pytest.approx(best, rel=2e-4)
+        assert found.cost == pytest.approx(cost(graph, backend.poses), rel=1e-9)
+        assert_array_equal(backend.poses, found.poses)
+        assert set(states(backend).values()) == {'accepted'}
+        assert np.isfinite(backend.loop_states().sigmas).all() == (options is EVERY)
+        assert backend.update() is None
+
+
+def test_a_settle_minimises_the_norms_that_were_asked_for(graph):
+    def cost_at(poses):
+        rows = whitened(graph, poses)
+        odometry = graph.between.is_odometry
+        return (rows[odometry] ** 2).sum() / 2 + np.abs(rows[~odometry]).sum()
+
+    found = []
+    for norms in ({'norm': 'l2', 'loop_norm': 'l1'}, {'norm': 'l1'}):
+        backend = l1.Backend(l1.BackendOptions.from_mapping({**EVERY_MESSAGE, 'solver': norms}))
+        play(backend, graph)
+        found.append(backend.settle())
+        # Updates in between leave the map of that norm alone.
+        backend.update(PLENTY)
+    now = backend.snapshot().graph
+    order = np.lexsort(now.between.pairs.T), np.lexsort(graph.between.pairs.T)
+    assert_array_equal(now.between.pairs[order[0]], graph.between.pairs[order[1]])
+    mixed, plain = found
+    assert mixed.cost == pytest.approx(cost_at(mixed.poses), rel=1e-6)
+    assert mixed.cost < cost_at(plain.poses)
+
+
+@pytest.mark.parametrize('dimension', [4, 0])
+def test_a_dimension_that_is_not_there_is_refused(dimension):
+    with pytest.raises(l1.L1SlamError, match=f'dimension is {dimension}, expected 2 or 3'):
+        l1.Backend(EVERY, dimension)
+
+
+def test_none_and_one_and_some_keyframes_are_no_trouble():
+    backend = l1.Backend(EVERY)
+    assert backend.update(PLENTY) is None and backend.saved() is None
+    assert backend.robot() is None and len(backend.poses) == 0
+    backend.add_odometry(odometry(1.0, (3.0, 4.0, 0.5)))
+    improvement = backend.update(PLENTY)
+    assert (improvement.status.value, improvement.cost) == ('converged', 0.0)
+    assert_allclose(backend.poses, [[3.0, 4.0, 0.5]])
+    assert_allclose(backend.robot().map_to_odom, [[0.0, 0.0, 0.0]], atol=1e-15)
+    settled(backend)
+    backend.reset()
+    assert len(backend.poses) == 0 and backend.robot() is None
+    assert settled(backend) == 0
+    drive(backend, 7, 12)
+    settled(backend)
+    assert_allclose(backend.poses[:, 0], np.arange(7.0, 12.0))
+
+
+def test_keyframes_after_an_update_follow_the_map(graph):
+    """By the transform that puts the last optimised one in its place."""
+    backend = played(graph, 0, 130)
+    settled(backend)
+    before, transform = backend.poses, backend.robot().map_to_odom
+    assert np.abs(transform).max() > 0.05
+    play(backend, graph, 130, 150)
+    assert_array_equal(backend.poses[:130], before)
+    robot = backend.robot()
+    assert_array_equal(robot.map_to_odom, transform)
+    assert robot.stamp == seconds(149 * PERIOD)
+    chain = odometry_of(graph)
+    assert_allclose(robot.odometry, chain[149:], atol=1e-9)
+    assert_allclose(between(backend.poses[129:], compose(transform, chain[129:])), 0, atol=1e-9)
+    # What moved since it was asked last.
+    backend.moved()
+    settled(backend)
+    moved = backend.moved()
+    assert_array_equal(moved[0], transform)
+    assert_array_equal(moved[1], backend.robot().map_to_odom)
+    assert np.abs(moved[1] - moved[0]).max() > 1e-4
+    assert_array_equal(*backend.moved())
+
+
+def test_a_large_map_comes_to_rest_though_no_update_ends_by_its_tests(graph, best):
+    """As where the budget is over after one linearisation, update after update."""
+    backend = played(graph, options=l1.BackendOptions.from_mapping(
+        {**EVERY_MESSAGE, 'solver': {'outer_iterations': 1}}))
+    assert not backend.behind().at_rest
+    settled(backend)
+    assert backend.behind().at_rest
+    assert cost(graph, backend.poses) == pytest.approx(best, rel=1e-3)
+    backend.add_odometry(odometry(15.0, backend.robot().odometry[0]))
+    assert not backend.behind().at_rest
+
+
+def test_small_budgets_judge_to_the_end(graph):
+    """A budget too short for one look at the loops leaves it behind, and it is done."""
+    backend = played(graph)
+    for _ in range(10**6):
+        if backend.update(0.0) is None:
+            break
+    assert set(states(backend).values()) == {'accepted'} and backend.behind().loops == 0
+
+
+def test_at_rest_there_is_something_to_do_once_something_comes():
+    backend = l1.Backend(EVERY)
+    drive(backend, 0, 30)
+    assert settled(backend) > 0
+    assert backend.update(PLENTY) is None
+    backend.counts()
+    assert backend.update(PLENTY) is None
+    backend.add_loop(loop(1.0, 29.0, (28.0, 0.0, 0.0), 1e-4 * np.eye(6)))
+    assert settled(backend) > 0 and states(backend) == {(1.0, 29.0): 'accepted'}
+    # A loop that waits for odometry which makes no keyframe.
+    backend.set_options(l1.BackendOptions.from_mapping(
+        {**EVERY_MESSAGE, 'keyframe': {'translation': 1e6, 'rotation': 0.0, 'period': 0.0}}))
+    backend.add_loop(loop(2.0, 33.0, (31.0, 0.0, 0.0), 1e-4 * np.eye(6)))
+    assert settled(backend) == 0
+    drive(backend, 31, 34)
+    assert len(backend.poses) >= 30 and settled(backend) > 0
+    assert states(backend)[2.0, 33.0] != 'waiting'
+
+
+def test_how_far_the_work_is_behind_is_said(graph, best):
+    backend = played(graph, 0, 100)
+    assert len(states(backend)) > 20
+    behind = backend.behind()
+    assert np.isnan([behind.age, behind.bound]).all()
+    assert behind.loops == len(states(backend)) and not behind.failing
+    settled(backend)
+    behind = backend.behind()
+    assert (behind.rows, behind.loops) == (0, 0) and 0 <= behind.age < PLENTY
+    play(backend, graph, 100, 104)
+    backend.update(0.0)
+    assert 0 < backend.behind().rows <= 3 * len(in_state(backend, 'accepted'))
+    play(backend, graph, 104)
+    backend.settle()
+    behind = backend.behind()
+    assert 0.99 * best < behind.bound <= best * (1 + 1e-9) and 0 <= behind.bound_age < PLENTY
+    # Without a factor that is believed nothing is proved.
+    reference, end = in_state(backend, 'accepted')[0]
+    backend.add_loop(replace(loop(0.0, 1.0, (0.0, 0.0, 0.0)), reference_stamp=int(reference),
+                             stamp=int(end), struck=True))
+    assert np.isnan(backend.behind().bound) or backend.update(0.0) is not None
+
+
+def test_options_may_change_on_the_way(graph):
+    backend = played(graph, 0, 40)
+    settled(backend)
+    poses = backend.poses
+    backend.set_options(l1.BackendOptions.from_mapping(
+        {'keyframe': {'translation': 1e6, 'rotation': 0.0, 'period': 0.0}}))
+    assert_array_equal(backend.poses, poses)
+    play(backend, graph, 40, 60)
+    assert len(backend.poses) == 40
+
+
+def test_each_loop_has_a_state_and_its_own_stamps(graph):
+    backend = l1.Backend(l1.BackendOptions.from_mapping({**EVERY_MESSAGE, 'loop': {'wait': 3.0}}))
+    assert states(backend) == {}
+    backend.add_loop(loop(0.0, 1e6, (1.0, 0.0, 0.0)))
+    backend.add_loop(loop(1.0, 20.0, (1.0, 0.0, 0.0)))
+    play(backend, graph, 0, 25)
+    backend.update(PLENTY)
+    assert states(backend)[0.0, 1e6] == states(backend)[1.0, 20.0] == 'waiting'
+    play(backend, graph, 25, 60)
+    backend.add_loop(loop(2.0, 50.0, (1.0, 0.0, 0.0)))
+    backend.update(PLENTY)
+    found = backend.loop_states()
+    rows, factors = found.rows, backend.snapshot().graph.between
+    assert_array_equal(rows, np.flatnonzero(~factors.is_odometry))
+    assert_array_equal(found.stamps[:len(rows)], factors.pairs[rows] * seconds(PERIOD))
+    assert_array_equal(found.robots, 0)
+    assert np.isfinite(found.sigmas[:len(rows)]).all()
+    assert np.isnan(found.sigmas[len(rows):]).all()
+    others = {key: state for key, state in states(backend).items()
+              if state not in ('accepted', 'rejected', 'suspect')}
+    assert others == {(0.0, 1e6): 'expired', (1.0, 20.0): 'expired', (2.0, 50.0): 'waiting'}
+    sizes = backend.counts().sizes
+    assert sizes['keyframes'] == 60 and sizes['factors'] == len(factors) == 59 + len(rows)
+    assert (sizes['waiting_loops'], sizes['expired_loops']) == (1, 2)
+    assert sum(sizes[f'{state}_loops'] for state in ('accepted', 'suspect', 'rejected')) == len(
+        rows)
+
+
+def test_a_loop_that_carries_all_it_closes_a_long_way_by_is_no_corner_to_stay_in():
+    """No reweighted step from there lowers the cost: the updates that followed did nothing."""
+    n, sigma = 300, np.array([0.02, 0.02, 0.02, 0.0005, 0.0005, 0.001])
+    backend, rng = l1.Backend(CREDULOUS, 3), np.random.default_rng(2)
+    manifold, step = backend.manifold, np.zeros((n - 1, 6))
+    step[:, 0], step[:, 5] = 1.0, 2 * np.pi / n
+    chains = []
+    for steps in (step, step + sigma * rng.standard_normal(step.shape)):
+        poses = manifold.identity(n)
+        for k, move in enumerate(manifold.retract(manifold.identity(n - 1), steps), 1):
+            poses[k] = manifold.compose(poses[k - 1], move)
+        chains.append(poses)
+    true, drifted = chains
+    for k, pose in enumerate(drifted):
+        backend.add_odometry(l1.OdometrySample(seconds(k), pose, np.diag(sigma**2), np.eye(6)))
+    backend.add_loop(l1.LoopClosure(0, seconds(n - 1), manifold.between(true[0], true[-1]),
+                                    np.diag(np.repeat([0.1, 0.005], 3)**2)))
+    found = backend.update(PLENTY)
+    best = l1.solve(backend.snapshot().graph, robust=False, start=true).cost
+    off = manifold.local(*(manifold.between(ends[0], ends[-1]) for ends in chains))
+    assert best < 0.9 * np.abs(off / np.repeat([0.1, 0.005], 3)).sum()
+    assert found.cost < 1.05 * best
+
+
+def test_several_loops_at_once_bring_a_drifted_drive_back():
+    """Two rounds of 200 m, loops from the second to the first."""
+    half, rng = 200, np.random.default_rng(0)
+    step = np.tile([1.0, 0.0, 2 * np.pi / half], (2 * half - 1, 1))
+    noise = np.array([0.3, 0.3, 0.03])
+    poses = np.zeros((2, 2 * half, 3))
+    for one, moves in zip(poses, (step, step + noise * rng.standard_normal(step.shape)),
+                          strict=True):
+        for k, move in enumerate(moves):
+            one[k + 1] = compose(one[k], move)
+    truth, drifted = poses
+    with l1.Backend(CREDULOUS) as backend:
+        for k, pose in enumerate(drifted):
+            backend.add_odometry(odometry(k, pose, np.diag([*noise[:2], 1, 1, 1, noise[2]])**2))
+        i = np.arange(0, half, 25)
+        for k in i.tolist():
+            backend.add_loop(loop(k, k + half, between(truth[k], truth[k + half]),
+                                  np.diag([0.1, 0.1, 1, 1, 1, 0.03])**2))
+        assert backend.update(PLENTY).reweighted_steps > 0
+        exact = between(truth[i], truth[i + half])
+        before, error = (np.abs(between(exact, between(poses[i], poses[i + half]))).max()
+                         for poses in (drifted, backend.poses))
+        assert before > 5 and error < 0.3
+        assert_array_equal(backend.poses[0], drifted[0])
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+@pytest.mark.parametrize('change, words', [
+    ({'pose3': np.zeros(3)}, r'pose3 of shape \(3,\); expected an array \(7,\)'),
+    ({'pose3': [0.0, 0, 0, 0, 0, 0, 1]}, 'pose3 of shape None'),
+    ({'covariance': np.eye(3)}, r'covariance of shape \(3, 3\)'),
+    ({'pose3': np.array([np.nan, 0, 0, 0, 0, 0, 1])}, 'expected finite numbers'),
+    ({'pose3': np.array([1e200, 0, 0, 0, 0, 0, 1])}, 'expected it within 1e'),
+    ({'pose3': np.zeros(7)}, 'of norm 0; expected 1'),
+    ({'stamp': 2**70}, 'expected whole nanoseconds to 2.62'),
+    ({'stamp': 2.5}, r'stamp \(.*2.5.*\); expected whole nanoseconds'),
+])
+def test_what_is_no_measurement_is_refused_and_leaves_no_trace(dimension, change, words):
+    here = np.array([0.0, 0, 0, 0, 0, 0, 1])
+    sample = l1.OdometrySample(10**9, here, np.eye(6), np.eye(6))
+    with l1.Backend(dimension=dimension) as backend:
+        backend.add_odometry(sample)
+        with pytest.raises(l1.L1SlamError, match=words):
+            backend.add_odometry(replace(sample, **{'stamp': 2 * 10**9, **change}))
+        with pytest.raises(l1.L1SlamError, match=words):
+            backend.add_loop(replace(l1.LoopClosure(10**9, 2 * 10**9, here, np.eye(6)), **change))
+        assert states(backend) == {} and len(backend.poses) == 1

@@ -1,0 +1,248 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""Several robots in one back end, and several drives of one: their maps, and what joins them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drives import EVERY, pose3, seconds, settled
+from numpy.testing import assert_allclose, assert_array_equal
+from team import Restarts, Team, fill, loops_by, poses_of
+from worlds import between, compose
+
+import l1slam_ros as l1
+
+
+def test_the_loops_that_batch_believes_are_believed_interleaved():
+    """The second robot is late."""
+    team, backend = Team(), l1.Backend(EVERY)
+    fill(backend, team.messages(late=5))
+    backend.settle()
+    now = backend.snapshot()
+    assert now.graph.n_poses == 400 and len(now.graph.firsts) == 1
+    assert np.count_nonzero(np.diff(now.graph.robot)) > 300
+    expected, found = team.believed(), loops_by(backend, 'accepted')
+    assert len(expected) > 200 and len(expected ^ found) <= 0.01 * len(expected)
+    for robot in (0, 1):
+        assert backend.robot(robot).joined
+        assert team.error(poses_of(backend, robot), robot) < 0.7
+
+
+def test_a_robot_that_nothing_joins_has_its_own_map_and_moves_whole_when_a_loop_is_believed():
+    team, backend = Team(lies=0, n=160, edges=500), l1.Backend(EVERY)
+    joins = []
+    for robot, message in team.messages():
+        if isinstance(message, l1.LoopClosure) and message.robots == (0, 1):
+            joins.append((robot, message))
+            continue
+        fill(backend, [(robot, message)])
+        if message.stamp == seconds(12):  # from its first second on
+            settled(backend)
+    backend.settle()
+    one = backend.robot(1)
+    assert backend.robot(0).joined and not one.joined
+    poses = poses_of(backend, 1)
+    assert_allclose(poses[0], [0.0, 0.0, 0.0], atol=1e-12)
+    assert_allclose(compose(one.map_to_odom, one.odometry), poses[-1:], atol=1e-9)
+    assert team.error(poses, 1, seen_from=80) < 0.5
+    # In its own map a pose is known as that of another robot from where it began.
+    own = [np.flatnonzero(backend.snapshot().graph.robot == robot) for robot in (0, 1)]
+    known = [backend.marginal_covariance(int(some[-1]), int(some[0])) for some in own]
+    assert_allclose(known[0], backend.marginal_covariance(int(own[0][-1])))
+    assert backend.marginal_covariance(160) is None
+    metres = [np.sqrt(np.trace(one[:2, :2])) for one in known]
+    assert metres[0] / 4 < metres[1] < 4 * metres[0] < 1.0
+    fill(backend, joins)
+    backend.settle()
+    one, poses = backend.robot(1), poses_of(backend, 1)
+    assert one.joined and len(joins) > 5
+    assert team.error(poses, 1) < 0.7
+    assert_allclose(compose(one.map_to_odom, one.odometry), poses[-1:], atol=1e-9)
+
+
+def test_a_map_of_two_robots_is_saved_and_goes_on():
+    """What was found as messages came is found of the saved map, too."""
+    team, backend = Team(n=120, edges=400, lies=40), l1.Backend(EVERY)
+    messages = team.messages()
+    for some in (messages[:300], messages[300:]):
+        for robot, message in some:
+            fill(backend, [(robot, message)])
+            if isinstance(message, l1.OdometrySample):
+                backend.update(0.0)
+        backend.settle()
+        before, backend = backend, l1.Backend(EVERY)
+        backend.restore(before.saved())
+        now, then = backend.snapshot().graph, before.snapshot().graph
+        assert_array_equal(now.robot, then.robot)
+        assert_array_equal(now.predecessor, then.predecessor)
+        assert_allclose(backend.poses, before.poses, atol=1e-9)
+        for state in ('accepted', 'suspect', 'rejected', 'waiting'):
+            assert loops_by(backend, state) == loops_by(before, state)
+        for robot in (0, 1):
+            assert_allclose(poses_of(backend, robot), poses_of(before, robot), atol=1e-9)
+            assert before.robot(robot).joined and backend.robot(robot) is None
+    assert len(backend.poses) == 120
+    with pytest.raises(l1.L1SlamError, match='a map of SE2, expected one of SE3'):
+        l1.Backend(EVERY, 3).restore(before.saved())
+
+
+def test_a_robot_comes_late_and_may_be_any():
+    """The second one alone, too: what the map is of is said by its number."""
+    team, backend = Team(lies=0, n=80, edges=240), l1.Backend(EVERY)
+    fill(backend, [(1, team.sample(k)) for k in range(40, 80)])
+    backend.settle()
+    assert backend.robot() is None and backend.robot(1) is not None
+    saved, backend = backend.saved(), l1.Backend(EVERY)
+    backend.restore(saved)
+    assert (backend.snapshot().graph.robot == 1).all()
+    fill(backend, [(0, team.sample(k)) for k in range(40)])
+    fill(backend, [(0, found) for *_, found in team.loops()])
+    backend.settle()
+    assert backend.robot(0).joined
+    assert_allclose(poses_of(backend, 0)[0], [0.0, 0.0, 0.0], atol=1e-12)
+    for robot in (0, 1):
+        assert team.error(poses_of(backend, robot), robot) < 0.7
+
+
+def test_a_reset_by_one_robot_is_one_for_all():
+    team = Team(n=40, edges=60, lies=0)
+    backend = l1.Backend(l1.BackendOptions.from_mapping({'on_time_jump': 'reset'}))
+    fill(backend, [(robot, team.sample(20 * robot + k)) for k in range(20) for robot in (0, 1)])
+    backend.settle()
+    fill(backend, [(0, team.sample(k)) for k in range(5)])  # its clock was set back
+    assert backend.counts().told == {'reset': 1}
+    assert set(backend.snapshot().graph.robot.tolist()) == {0} and len(backend.poses) < 10
+    for k in range(15, 20):
+        backend.add_odometry(replace(team.sample(20 + k), stamp=seconds(40 + k)), 1)
+    backend.settle()
+    now = backend.snapshot()
+    assert set(now.graph.robot.tolist()) == {0, 1}
+    # Its first keyframe is where its odometry has it.
+    first = np.argmax(now.graph.robot == 1)
+    assert_allclose(poses_of(backend, 1)[0], now.odometry[first], atol=1e-12)
+
+
+@pytest.mark.parametrize('robot', [-1, 'r1', None, 0.5])
+def test_no_number_of_a_robot(robot):
+    sample = l1.OdometrySample(1, pose3((0.0, 0.0, 0.0)), np.eye(6), np.eye(6))
+    with pytest.raises(l1.L1SlamError, match='the robot is'):
+        l1.Backend(EVERY).add_odometry(sample, robot)
+
+
+# Robots that begin their odometry again on the way
+
+
+@pytest.mark.parametrize(('world', 'most'), [('streets', 0.5), ('building', 0.8)])
+def test_three_robots_that_restart_have_the_loops_of_the_batch(world, most):
+    team = Restarts(30, back=True, n=180, edges=630, lies=60, world=world)
+    backend = l1.Backend(EVERY, 2 if world == 'streets' else 3)
+    for robot, message in team.messages():
+        fill(backend, [(robot, message)])
+        if robot == 0 and isinstance(message, l1.OdometrySample):
+            backend.update(0.0)
+    backend.settle()
+    now = backend.snapshot().graph
+    assert now.robot[now.firsts].tolist() == [1, 2, 1, 2]
+    assert backend.counts().told == {'new_part': 2}
+    expected = team.believed(team.firsts) & loops_by(backend)
+    found = loops_by(backend, 'accepted')
+    assert len(expected) > 300 and len(expected ^ found) <= 0.01 * len(expected)
+    for robot in range(3):
+        poses = poses_of(backend, robot)
+        assert backend.robot(robot).joined and len(poses) == 60
+        assert team.error(poses, robot) < most
+
+
+@pytest.mark.parametrize('joined_first', [0, 1])
+def test_a_new_part_stands_where_its_robot_was_and_goes_with_it(joined_first):
+    """Keyframes of others come between; what joins one part moves both."""
+    team, backend, joins = Restarts(37, n=240, edges=840, lies=0), l1.Backend(EVERY), ([], [])
+    at = team.at
+
+    def guess():
+        """Return the step from the end of the one part to the begin of the other."""
+        poses = poses_of(backend, 2)
+        return between(poses[at - 1], poses[at])
+
+    def join(part):
+        """Let the loops come that join a part, and each be used at once."""
+        for message in joins[part]:
+            fill(backend, [message])
+            backend.update(0.05)
+        settled(backend)
+
+    parts = {(found.robots, found.stamps): {
+        int(team.number(k) >= at) for k in (i, j) if team.robot[k] == 2}
+        for i, j, found in team.loops()}
+    for robot, message in team.messages():
+        if isinstance(message, l1.OdometrySample):
+            fill(backend, [(robot, message)])
+            backend.update(0.0)
+        elif 2 in message.robots and {*message.robots} != {2}:
+            (part,) = parts[message.robots, message.stamps]
+            joins[part].append((robot, message))
+        elif len(parts[message.robots, message.stamps]) < 2:
+            fill(backend, [(robot, message)])
+    backend.settle()
+    assert_allclose(guess(), 0.0, atol=1e-9)
+    assert not backend.robot(2).joined
+    join(joined_first)
+    assert_allclose(guess(), 0.0, atol=1e-9)
+    assert backend.robot(2).joined
+    backend.settle()
+    assert_allclose(guess(), 0.0, atol=1e-9)
+    join(1 - joined_first)
+    truth = team.truth[team.robot == 2]
+    assert_allclose(guess(), between(truth[at - 1], truth[at]), atol=0.2)
+
+
+# Drives of several days
+
+_DAY = seconds(86400)
+_FAR = np.array([500.0, 300.0, 1.0])
+# Loops of one day that agree on a turned and moved map, between keyframes of it.
+_LIES, _MOVED = [(k, 80 + k) for k in range(6)], np.array([0.9, -0.6, 0.06])
+
+
+def test_a_drive_from_elsewhere_joins_the_loaded_map_and_what_that_believed_is_doubted():
+    """The halves of a world are drives of one robot, of which the first one ends with lies."""
+    team, backend = Team(n=240, edges=840, lies=100), l1.Backend(EVERY)
+    *_, (_, _, like) = team.loops()
+    like = replace(like, robot=0, reference_robot=None)
+    fill(backend, [(0, team.sample(k)) for k in range(120)])
+    for i, j in _LIES:
+        seen = between(team.truth[i], compose(_MOVED, team.truth[j]))
+        backend.add_loop(replace(like, reference_stamp=team.stamp(i), stamp=team.stamp(j),
+                                 pose3=pose3(seen)))
+    backend.settle()
+    lies = {(0, 0, team.stamp(i), team.stamp(j)) for i, j in _LIES}
+    assert loops_by(backend, 'accepted') == lies
+    before, backend = backend, l1.Backend(EVERY)
+    backend.restore(before.saved())
+    assert_allclose(backend.poses, before.poses, atol=1e-9)
+    for robot, message in team.messages():
+        if isinstance(message, l1.OdometrySample):
+            if robot == 1:
+                k = message.stamp // 10**9 + 110
+                backend.add_odometry(replace(message, stamp=message.stamp + _DAY, pose3=pose3(
+                    compose(_FAR, team.odometry[k]))))
+                backend.update(0.0)
+        elif robot == 1:
+            reference, stamp = (stamp + _DAY * day for day, stamp in zip(
+                message.robots, message.stamps, strict=True))
+            backend.add_loop(replace(message, reference_stamp=reference, stamp=stamp, robot=0,
+                                     reference_robot=None))
+    backend.settle()
+    assert backend.snapshot().graph.firsts.tolist() == [120]
+    assert backend.counts().told == {'new_part': 1}
+    believed = loops_by(backend, 'accepted')
+    assert len(believed) > 300 and not lies & believed
+    truth = between(np.broadcast_to(team.truth[0], (240, 3)), team.truth)
+    assert np.abs(backend.poses - truth)[:, :2].max() < 0.7
