@@ -132,13 +132,16 @@ def messages(graph, first=0, last=None):
     """Yield the sample of each keyframe first to last of a graph, and the loops that end there."""
     factors, manifold, covariances = graph.between, graph.manifold, covariances_of(graph)
     poses = manifold.to_pose3(odometry_of(graph))
-    measured, loops = manifold.to_pose3(factors.measurement), ~factors.is_odometry
+    measured, ends = manifold.to_pose3(factors.measurement), np.maximum(factors.i, factors.j)
+    loops = np.flatnonzero(~factors.is_odometry)
+    loops = loops[np.argsort(ends[loops], kind='stable')]
+    first_of = np.searchsorted(ends[loops], np.arange(graph.n_poses + 1))
     for k in islice(range(graph.n_poses), first, last):
         step = factors.step_to[k]
         yield l1.OdometrySample(seconds(k * PERIOD), poses[k],
                                 covariances[step] if step >= 0 else _NOTHING, _NOTHING)
-        for row in np.flatnonzero(loops & (factors.j == k)):
-            yield l1.LoopClosure(seconds(factors.i[row] * PERIOD), seconds(k * PERIOD),
+        for row in loops[first_of[k]:first_of[k + 1]].tolist():
+            yield l1.LoopClosure(seconds(factors.i[row] * PERIOD), seconds(factors.j[row] * PERIOD),
                                  measured[row], covariances[row])
 
 
