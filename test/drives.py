@@ -132,17 +132,17 @@ def messages(graph, first=0, last=None):
     """Yield the sample of each keyframe first to last of a graph, and the loops that end there."""
     factors, manifold, covariances = graph.between, graph.manifold, covariances_of(graph)
     poses = manifold.to_pose3(odometry_of(graph))
-    measured, ends = manifold.to_pose3(factors.measurement), np.maximum(factors.i, factors.j)
+    measured, later = manifold.to_pose3(factors.measurement), np.maximum(factors.i, factors.j)
     loops = np.flatnonzero(~factors.is_odometry)
-    loops = loops[np.argsort(ends[loops], kind='stable')]
-    first_of = np.searchsorted(ends[loops], np.arange(graph.n_poses + 1))
+    loops = loops[np.argsort(later[loops], kind='stable')]
+    first_of = np.searchsorted(later[loops], np.arange(graph.n_poses + 1))
     for k in islice(range(graph.n_poses), first, last):
         step = factors.step_to[k]
         yield l1.OdometrySample(seconds(k * PERIOD), poses[k],
                                 covariances[step] if step >= 0 else _NOTHING, _NOTHING)
         for row in loops[first_of[k]:first_of[k + 1]].tolist():
-            yield l1.LoopClosure(seconds(factors.i[row] * PERIOD), seconds(factors.j[row] * PERIOD),
-                                 measured[row], covariances[row])
+            ends = (seconds(end * PERIOD) for end in (factors.i[row], factors.j[row]))
+            yield l1.LoopClosure(*ends, measured[row], covariances[row])
 
 
 def hear(backend, found, robot=0):
