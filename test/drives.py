@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
+from heard import PERIOD, UNKNOWN, covariance6, odometry, seconds
 from records import information_of
 from worlds import false_of, made, truth_of
 
@@ -23,10 +24,8 @@ EVERY_MESSAGE = {'keyframe': {'translation': 0.0, 'rotation': 0.0, 'period': 0.0
 EVERY = l1.BackendOptions.from_mapping(EVERY_MESSAGE)
 # Every loop is used, however far off.
 CREDULOUS = l1.BackendOptions.from_mapping({**EVERY_MESSAGE, 'robust': {'enabled': False}})
-PERIOD = 0.1  # [s] from one keyframe to the next
 PLENTY = 60.0  # [s] of budget: an update then ends by its own tests, on any machine
 STATES = ('waiting', 'suspect', 'accepted', 'rejected', 'expired')
-_NOTHING = np.zeros((6, 6))
 
 
 @dataclass(frozen=True)
@@ -50,23 +49,10 @@ def simulated(folder, poses, edges, *more):
     return World(l1.read_graph(path)[0], truth_of(path), false)
 
 
-def careful(world):
-    """Return the world with half the noise of rotations in its odometry, which states that."""
-    manifold, factors = world.graph.manifold, world.graph.between
-    exact = manifold.between(world.truth[factors.i], world.truth[factors.j])
-    noise, information = manifold.local(exact, factors.measurement), information_of(world.graph)
-    rows, turn = factors.is_odometry, slice(-1 if noise.shape[1] == 3 else -3, None)
-    noise[rows, turn] /= 2
-    information[rows, turn, turn] *= 4
-    return World(remeasured(world.graph, manifold.retract(exact, noise), information),
-                 world.truth, world.false)
-
-
-def remeasured(graph, measurement, information=None):
-    """Return the graph with other measurements (m, p) and information (m, d, d), if any."""
+def remeasured(graph, measurement):
+    """Return the graph with other measurements (m, p)."""
     other = l1.FactorGraph(graph.manifold, graph.n_poses)
-    other.add_between(graph.between.i, graph.between.j, measurement,
-                      information_of(graph) if information is None else information)
+    other.add_between(graph.between.i, graph.between.j, measurement, information_of(graph))
     return other
 
 
@@ -94,34 +80,6 @@ def covariances_of(graph):
     return whole
 
 
-def seconds(value):
-    """Return a stamp [ns]."""
-    return round(value * 1e9)
-
-
-def covariance6(covariance):
-    """Return the covariance of a message whose x, y, yaw have this one, (3, 3)."""
-    whole = np.zeros((6, 6))
-    whole[np.ix_((0, 1, 5), (0, 1, 5))] = covariance
-    return whole
-
-
-def pose3(pose):
-    """Return a pose x, y, theta as x y z qx qy qz qw."""
-    x, y, theta = pose
-    return np.array([x, y, 0.0, 0.0, 0.0, np.sin(theta / 2), np.cos(theta / 2)])
-
-
-def odometry(time, pose, covariance=_NOTHING):
-    """Return the sample of a robot at x, y, theta; time : [s]."""
-    return l1.OdometrySample(seconds(time), pose3(pose), covariance, _NOTHING)
-
-
-def loop(reference_time, time, pose, covariance=_NOTHING, **more):
-    """Return the loop that saw the robot at x, y, theta; times : [s]."""
-    return l1.LoopClosure(seconds(reference_time), seconds(time), pose3(pose), covariance, **more)
-
-
 def drive(backend, first, last, step=1.0):
     """Drive straight ahead: keyframe k at k `step` [m] and k [s]."""
     for k in range(first, last):
@@ -139,24 +97,19 @@ def messages(graph, first=0, last=None):
     for k in islice(range(graph.n_poses), first, last):
         step = factors.step_to[k]
         yield l1.OdometrySample(seconds(k * PERIOD), poses[k],
-                                covariances[step] if step >= 0 else _NOTHING, _NOTHING)
+                                covariances[step] if step >= 0 else UNKNOWN, UNKNOWN)
         for row in loops[first_of[k]:first_of[k + 1]].tolist():
             ends = (seconds(end * PERIOD) for end in (factors.i[row], factors.j[row]))
             yield l1.LoopClosure(*ends, measured[row], covariances[row])
 
 
-def hear(backend, found, robot=0):
-    """Add samples and loops."""
-    for message in found:
+def play(backend, graph, first=0, last=None):
+    """Add keyframes first to last of a graph and the loops that end there."""
+    for message in messages(graph, first, last):
         if isinstance(message, l1.LoopClosure):
             backend.add_loop(message)
         else:
-            backend.add_odometry(message, robot)
-
-
-def play(backend, graph, first=0, last=None):
-    """Add keyframes first to last of a graph and the loops that end there."""
-    hear(backend, messages(graph, first, last))
+            backend.add_odometry(message)
 
 
 def played(graph, first=0, last=None, options=EVERY):

@@ -12,14 +12,11 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from drives import STATES, careful, covariances_of, odometry_of, seconds, simulated
+from drives import STATES, covariances_of, odometry_of, simulated
+from heard import UNKNOWN, seconds
 from records import information_of
 
 import l1slam_ros as l1
-
-_UNKNOWN = np.zeros((6, 6))
-# Stamps of those that restart begin so much later, so that a clock may be set back.
-_LATER, _BACK = seconds(2000), seconds(1000)
 
 
 class Team:
@@ -28,8 +25,7 @@ class Team:
     def __init__(self, n=400, edges=1400, lies=300, seed=3, robots=2, world='streets'):
         false = ('--false-loops', lies) if lies else ()
         with tempfile.TemporaryDirectory() as name:
-            whole = careful(simulated(Path(name), n, edges, '--seed', seed, '--world', world,
-                                      *false))
+            whole = simulated(Path(name), n, edges, '--seed', seed, '--world', world, *false)
         self.share = n // robots
         self.robot = np.minimum(np.arange(n) // self.share, robots - 1)
         self.truth, self.manifold = whole.truth, whole.graph.manifold
@@ -61,7 +57,7 @@ class Team:
         step = self._factors.step_to[k]
         return l1.OdometrySample(
             self.stamp(k), self.manifold.to_pose3(self.odometry[k:k + 1])[0],
-            self._covariances[step] if step >= 0 else _UNKNOWN, _UNKNOWN)
+            self._covariances[step] if step >= 0 else UNKNOWN, UNKNOWN)
 
     def loops(self):
         """Yield the keyframes of loops, and them."""
@@ -104,37 +100,17 @@ class Team:
 
 
 class Restarts(Team):
-    """
-    A team whose robots 1 and 2 begin again at some keyframe of theirs, far off in their odometry.
+    """Three robots, of which 1 and 2 begin again at some keyframe, far off in their odometry."""
 
-    The clock of robot 2 is set back by then, if it is to be.
-    """
-
-    def __init__(self, at, back=False, **of_team):
-        self.at, self._back = at, back
+    def __init__(self, at, **of_team):
         super().__init__(robots=3, **of_team)
         far = np.linspace(0.3, 0.1, self.manifold.TANGENT_SIZE)
         far[:2] = 300.0, 200.0
         far = self.manifold.retract(self.manifold.identity(1), far[None])
         self.firsts = [robot * self.share + at for robot in (1, 2)]
         for first in self.firsts:
-            part = slice(first, first - at + self.share)
-            self.odometry[part] = self.manifold.compose(
-                np.broadcast_to(far, self.odometry[part].shape), self.odometry[part])
-
-    def stamp(self, k):
-        return super().stamp(k) + _LATER - _BACK * self._is_of_a_new_clock(k)
-
-    def _is_of_a_new_clock(self, k):
-        return self._back and self.robot[k] == 2 and self.number(k) >= self.at
-
-    def loops(self):
-        """Yield them; nobody names times of a clock that is no more."""
-        for i, j, found in super().loops():
-            set_back = self._back and max(self.number(i), self.number(j)) >= self.at
-            if not (set_back and any(self.robot[k] == 2 and not self._is_of_a_new_clock(k)
-                                     for k in (i, j))):
-                yield i, j, found
+            part = self.odometry[first:first - at + self.share]
+            part[:] = self.manifold.compose(np.broadcast_to(far, part.shape), part)
 
 
 def fill(backend, messages):

@@ -14,18 +14,8 @@ import time
 
 import numpy as np
 import pytest
-from drives import (
-    EVERY,
-    covariance6,
-    drive,
-    in_state,
-    loop,
-    odometry,
-    played,
-    settled,
-    simulated,
-    states,
-)
+from drives import EVERY, drive, in_state, played, settled, simulated, states
+from heard import covariance6, loop, odometry
 from worlds import compose, whitened
 
 import l1slam_ros as l1
@@ -247,35 +237,6 @@ def test_several_threads_may_settle_at_once(graph):
         thread.join(DEADLINE)
     assert len(found) == 4 and {len(one.poses) for one in found} == {150}
     assert [one.cost for one in found] == pytest.approx(4 * [found[0].cost], rel=1e-6)
-
-
-def test_who_waits_to_settle_can_be_told_to_stop(options):
-    held = Watched.meet = Held()
-    backend, ended = l1.Backend(options), []
-    drive(backend, 0, 20)
-    first = meanwhile(lambda: ended.append(backend.settle()))
-    assert held.reached.wait(DEADLINE)
-    with pytest.raises(Exception, match='^$'):
-        backend.settle(lambda: True)
-    assert first.is_alive()
-    held.goes_on.set()
-    first.join(DEADLINE)
-    assert ended[0].cost == pytest.approx(0.0, abs=1e-6)
-
-
-def test_work_behind_waits_while_there_is_calm_and_makes_way_all_the_same():
-    backend, solved = l1.Backend(EVERY), []
-    drive(backend, 0, 20)
-    with backend.calm:
-        solving = meanwhile(lambda: solved.append(backend.settle()))
-        solving.join(MOMENT)
-        assert not solved
-    solving.join(DEADLINE)
-    assert solved[0] is not None
-    drive(backend, 20, 21)
-    asked = iter([False] * 4)
-    with backend.calm, pytest.raises(Exception, match='^$'):
-        backend.settle(lambda: next(asked, True))
 
 
 def test_what_one_thread_sees_is_of_one_map_whatever_others_do():

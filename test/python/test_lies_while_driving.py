@@ -10,31 +10,27 @@
 
 import time
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from drives import (
     CREDULOUS,
     EVERY,
-    PERIOD,
     PLENTY,
     World,
-    careful,
-    covariance6,
     in_state,
-    loop,
     messages,
-    odometry,
     odometry_of,
     play,
     played,
     remeasured,
-    seconds,
     settled,
     simulated,
     states,
     turning,
 )
+from heard import PERIOD, covariance6, loop, odometry, seconds
 from numpy.testing import assert_allclose
 from worlds import between, compose, position_error
 
@@ -45,21 +41,14 @@ N, FALSE = 300, 130  # keyframes and false loops
 
 @pytest.fixture(scope='module')
 def world(tmp_path_factory):
-    return careful(simulated(tmp_path_factory.mktemp('clean'), N, 2 * N))
+    return simulated(tmp_path_factory.mktemp('clean'), N, 2 * N)
 
 
 @pytest.fixture(scope='module')
 def spoilt(tmp_path_factory):
     """The same drive with false loops of a kind."""
-    made = {}
-
-    def make(kind):
-        if kind not in made:
-            made[kind] = careful(simulated(tmp_path_factory.mktemp(kind), N, 2 * N,
-                                           '--false-loops', FALSE, '--kind', kind))
-        return made[kind]
-
-    return make
+    return cache(lambda kind: simulated(tmp_path_factory.mktemp(kind), N, 2 * N,
+                                        '--false-loops', FALSE, '--kind', kind))
 
 
 def error_of(backend, truth):
@@ -218,7 +207,7 @@ DRIFT = 0.05  # [rad/m]
 
 @pytest.fixture(scope='module')
 def bad(tmp_path_factory):
-    return careful(simulated(tmp_path_factory.mktemp('drift'), 400, 800, '--false-loops', 100))
+    return simulated(tmp_path_factory.mktemp('drift'), 400, 800, '--false-loops', 100)
 
 
 def test_odometry_that_drifts_is_corrected_while_driving_and_at_rest(bad):
