@@ -30,22 +30,18 @@ STATES = ('waiting', 'suspect', 'accepted', 'rejected', 'expired')
 
 @dataclass(frozen=True)
 class World:
-    """A graph, its true poses (n, p), and the keyframes of its false loops."""
+    """A graph, its true poses (n, p), and its false loops as `loops_by` has them."""
 
     graph: l1.FactorGraph
     truth: np.ndarray
     false: set
 
-    def is_false(self, stamps):
-        """Tell which loops of these stamps (l, 2) are false."""
-        pairs = np.round(stamps / seconds(PERIOD)).astype(int).tolist()
-        return np.array([tuple(pair) in self.false for pair in pairs], bool)
-
 
 def simulated(folder, poses, edges, *more):
     """Return a world of `l1slam simulate`."""
     path = made(folder / 'world.g2o', poses, edges, *more)
-    false = {tuple(sorted(pair)) for pair in false_of(path)} if '--false-loops' in more else set()
+    pairs = np.sort(false_of(path), axis=1) if '--false-loops' in more else np.zeros((0, 2))
+    false = {(0, 0, *map(seconds, pair)) for pair in (pairs * PERIOD).tolist()}
     return World(l1.read_graph(path)[0], truth_of(path), false)
 
 
@@ -129,12 +125,13 @@ def settled(backend):
 
 def states(backend):
     """Return what has become of loops by their stamps [s]: {(reference, end): state}."""
-    found = backend.loop_states()
-    return {tuple(stamps): STATES[state] for stamps, state in zip(
-        (found.stamps / 1e9).tolist(), found.state.tolist(), strict=True)}
+    return {(i / 1e9, j / 1e9): state for state in STATES
+            for _, _, i, j in loops_by(backend, state)}
 
 
-def in_state(backend, state):
-    """Return the stamps [ns] of the loops in a state, (l, 2)."""
+def loops_by(backend, *named):
+    """Return robots and stamps [ns] of the loops in some states, or of all: {(r, r, i, j)}."""
     found = backend.loop_states()
-    return found.stamps[found.state == STATES.index(state)]
+    return {(*robots, *stamps) for robots, stamps, state in zip(
+        found.robots.tolist(), found.stamps.tolist(), found.state.tolist(), strict=True)
+        if not named or STATES[state] in named}

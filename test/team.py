@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from drives import STATES, covariances_of, odometry_of, simulated
+from drives import covariances_of, odometry_of, simulated
 from heard import UNKNOWN, seconds
 from records import information_of
 
@@ -120,14 +120,6 @@ def fill(backend, messages):
             backend.add_loop(message)
         else:
             backend.add_odometry(message, robot)
-
-
-def loops_by(backend, *named):
-    """Return robots and stamps of the loops in some states, or of all."""
-    found = backend.loop_states()
-    return {(*robots, *stamps) for robots, stamps, state in zip(
-        found.robots.tolist(), found.stamps.tolist(), found.state.tolist(), strict=True)
-        if not named or STATES[state] in named}
 
 
 def poses_of(backend, robot):

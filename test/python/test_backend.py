@@ -18,7 +18,7 @@ from drives import (
     EVERY_MESSAGE,
     PLENTY,
     drive,
-    in_state,
+    loops_by,
     odometry_of,
     play,
     played,
@@ -26,7 +26,7 @@ from drives import (
     simulated,
     states,
 )
-from heard import PERIOD, loop, odometry, seconds
+from heard import PERIOD, begun, loop, odometry, seconds
 from numpy.testing import assert_allclose, assert_array_equal
 from records import information_of
 from worlds import between, compose, whitened
@@ -88,24 +88,18 @@ def test_settled_the_map_is_the_optimum_and_all_loops_are_judged(graph, best, op
 
 
 def test_a_settle_minimises_the_norms_that_were_asked_for(graph):
-    def cost_at(poses):
-        rows = whitened(graph, poses)
-        odometry = graph.between.is_odometry
-        return (rows[odometry] ** 2).sum() / 2 + np.abs(rows[~odometry]).sum()
-
     found = []
     for norms in ({'norm': 'l2', 'loop_norm': 'l1'}, {'norm': 'l1'}):
-        backend = l1.Backend(l1.BackendOptions.from_mapping({**EVERY_MESSAGE, 'solver': norms}))
+        backend = begun({**EVERY_MESSAGE, 'solver': norms})
         play(backend, graph)
-        found.append(backend.settle())
-        # Updates in between leave the map of that norm alone.
-        backend.update(PLENTY)
-    now = backend.snapshot().graph
-    order = np.lexsort(now.between.pairs.T), np.lexsort(graph.between.pairs.T)
-    assert_array_equal(now.between.pairs[order[0]], graph.between.pairs[order[1]])
+        backend.settle()
+        rows = whitened(graph, backend.poses)
+        odometry = graph.between.is_odometry
+        found.append((rows[odometry] ** 2).sum() / 2 + np.abs(rows[~odometry]).sum())
     mixed, plain = found
-    assert mixed.cost == pytest.approx(cost_at(mixed.poses), rel=1e-6)
-    assert mixed.cost < cost_at(plain.poses)
+    assert mixed < 0.99 * plain
+    assert mixed == pytest.approx(
+        l1.solve(graph, norm='l2', loop_norm='l1', robust=False).cost, rel=1e-6)
 
 
 @pytest.mark.parametrize('dimension', [4, 0])
@@ -158,8 +152,8 @@ def test_keyframes_after_an_update_follow_the_map(graph):
 
 def test_a_large_map_comes_to_rest_though_no_update_ends_by_its_tests(graph, best):
     """As where the budget is over after one linearisation, update after update."""
-    backend = played(graph, options=l1.BackendOptions.from_mapping(
-        {**EVERY_MESSAGE, 'solver': {'outer_iterations': 1}}))
+    backend = begun({**EVERY_MESSAGE, 'solver.outer_iterations': 1})
+    play(backend, graph)
     assert not backend.behind().at_rest
     settled(backend)
     assert backend.behind().at_rest
@@ -168,20 +162,18 @@ def test_a_large_map_comes_to_rest_though_no_update_ends_by_its_tests(graph, bes
     assert not backend.behind().at_rest
 
 
-def test_at_rest_there_is_something_to_do_once_something_comes():
+def test_options_may_change_on_the_way():
+    """A loop may wait for odometry that makes no keyframe."""
     backend = l1.Backend(EVERY)
     drive(backend, 0, 30)
     assert settled(backend) > 0 and settled(backend) == 0
-    backend.add_loop(loop(1.0, 29.0, (28.0, 0.0, 0.0), 1e-4 * np.eye(6)))
-    assert settled(backend) > 0 and states(backend) == {(1.0, 29.0): 'accepted'}
-    # A loop that waits for odometry which makes no keyframe.
     backend.set_options(l1.BackendOptions.from_mapping(
-        {**EVERY_MESSAGE, 'keyframe': {'translation': 1e6, 'rotation': 0.0, 'period': 0.0}}))
-    backend.add_loop(loop(2.0, 33.0, (31.0, 0.0, 0.0), 1e-4 * np.eye(6)))
+        {'keyframe': {'translation': 1e6, 'rotation': 0.0, 'period': 0.0}}))
+    backend.add_loop(loop(1.0, 33.0, (32.0, 0.0, 0.0), 1e-4 * np.eye(6)))
     assert settled(backend) == 0
-    drive(backend, 31, 34)
-    assert len(backend.poses) >= 30 and settled(backend) > 0
-    assert states(backend)[2.0, 33.0] != 'waiting'
+    drive(backend, 30, 34)
+    assert settled(backend) > 0 and states(backend)[1.0, 33.0] != 'waiting'
+    assert 30 <= len(backend.poses) <= 31
 
 
 def test_how_far_the_work_is_behind_is_said(graph, best):
@@ -195,31 +187,15 @@ def test_how_far_the_work_is_behind_is_said(graph, best):
     assert (behind.rows, behind.loops) == (0, 0) and 0 <= behind.age < PLENTY
     play(backend, graph, 100, 104)
     backend.update(0.0)
-    assert 0 < backend.behind().rows <= 3 * len(in_state(backend, 'accepted'))
+    assert 0 < backend.behind().rows <= 3 * len(loops_by(backend, 'accepted'))
     play(backend, graph, 104)
     backend.settle()
     behind = backend.behind()
     assert 0.99 * best < behind.bound <= best * (1 + 1e-9) and 0 <= behind.bound_age < PLENTY
-    # Without a factor that is believed nothing is proved.
-    reference, end = in_state(backend, 'accepted')[0]
-    backend.add_loop(replace(loop(0.0, 1.0, (0.0, 0.0, 0.0)), reference_stamp=int(reference),
-                             stamp=int(end), struck=True))
-    assert np.isnan(backend.behind().bound) or backend.update(0.0) is not None
-
-
-def test_options_may_change_on_the_way(graph):
-    backend = played(graph, 0, 40)
-    settled(backend)
-    poses = backend.poses
-    backend.set_options(l1.BackendOptions.from_mapping(
-        {'keyframe': {'translation': 1e6, 'rotation': 0.0, 'period': 0.0}}))
-    assert_array_equal(backend.poses, poses)
-    play(backend, graph, 40, 60)
-    assert len(backend.poses) == 40
 
 
 def test_each_loop_has_a_state_and_its_own_stamps(graph):
-    backend = l1.Backend(l1.BackendOptions.from_mapping({**EVERY_MESSAGE, 'loop': {'wait': 3.0}}))
+    backend = begun({**EVERY_MESSAGE, 'loop': {'wait': 3.0}})
     assert states(backend) == {}
     backend.add_loop(loop(0.0, 1e6, (1.0, 0.0, 0.0)))
     backend.add_loop(loop(1.0, 20.0, (1.0, 0.0, 0.0)))

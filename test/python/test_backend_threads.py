@@ -14,9 +14,9 @@ import time
 
 import numpy as np
 import pytest
-from drives import EVERY, drive, in_state, played, settled, simulated, states
-from heard import covariance6, loop, odometry
-from worlds import compose, whitened
+from drives import EVERY, drive, play, played, settled, simulated, states
+from heard import loop
+from worlds import whitened
 
 import l1slam_ros as l1
 
@@ -89,13 +89,15 @@ def close_loop(backend):
     backend.add_loop(loop(1.0, 29.0, (28.0, 0.0, 0.0), 1e-4 * np.eye(6)))
 
 
-def test_in_the_background_what_comes_is_judged_and_the_threads_end():
+def test_in_the_background_what_comes_is_judged_and_the_threads_end(graph):
     before = threading.active_count()
     with l1.Backend(EVERY, background=True) as backend:
-        drive(backend, 0, 30)
-        close_loop(backend)
-        wait_until(lambda: list(states(backend).values()) == ['accepted'])
-        wait_until(lambda: backend.update() is None)
+        play(backend, graph)
+        wait_until(lambda: set(states(backend).values()) == {'accepted'})
+        wait_until(lambda: backend.behind().at_rest)
+        # Some loops may have bent it first where all together would not.
+        best = l1.solve(graph, robust=False).cost
+        assert np.abs(whitened(graph, backend.poses)).sum() < 1.01 * best
         # A map that takes the place of another is woken for too.
         backend.restore(backend.saved())
         assert not backend.behind().at_rest
@@ -103,7 +105,7 @@ def test_in_the_background_what_comes_is_judged_and_the_threads_end():
         assert threading.active_count() > before
     assert threading.active_count() == before
     drive(backend, 30, 32)
-    assert backend.update() is not None and len(backend.poses) == 32
+    assert backend.update() is not None and len(backend.poses) == 152
 
 
 def test_answers_come_while_an_improvement_is_computed(options):
@@ -273,27 +275,6 @@ def test_what_one_thread_sees_is_of_one_map_whatever_others_do():
     assert len(seen) > 20 and all(seen)
 
 
-def test_a_square_that_closes_after_1200_keyframes_is_right_soon(rng):
-    side, more, sigma = 300, 20, np.array([0.05, 0.05, 0.002])
-    step, covariance = np.array([1.0, 0.0, 0.0]), covariance6(np.diag(sigma**2))
-    with l1.Backend(EVERY, background=True) as backend:
-        pose = np.zeros(3)
-        for k in range(4 * side + more):
-            backend.add_odometry(odometry(k, pose, covariance))
-            turn = np.array([0.0, 0.0, np.pi / 2 * (k % side == side - 1)])
-            pose = compose(pose, step + turn + sigma * rng.standard_normal(3))
-            if k >= 4 * side:
-                backend.add_loop(loop(k - 4 * side, k, sigma * rng.standard_normal(3),
-                                      covariance))
-        wait_until(lambda: len(in_state(backend, 'accepted')) == more)
-        wait_until(lambda: backend.update(0.0) is None)
-        poses, graph = backend.poses, backend.snapshot().graph
-        best = backend.settle().cost
-    # Some loops may have bent it first where all together would not: it can rest above the best.
-    assert np.abs(whitened(graph, poses)).sum() < 1.2 * best
-    assert np.linalg.norm(poses[4 * side, :2]) < 1.0
-
-
 def test_a_process_that_is_forked_has_a_back_end_at_rest(graph):
     """Threads do not come along, what they have locked does."""
     with played(graph) as plain, l1.Backend(EVERY, background=True) as backend:
@@ -305,10 +286,9 @@ def test_a_process_that_is_forked_has_a_back_end_at_rest(graph):
                 drive(backend, 5, 7)
                 backend.settle()
                 backend.close()
-                plain.settle()
             finally:
-                os._exit(len(backend.poses) * (len(plain.poses) == 150))
+                os._exit(len(backend.poses))
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
         working.join(DEADLINE)
         wait_until(lambda: backend.behind().at_rest)
-        assert len(backend.poses) == 5
+        assert len(backend.poses) == 5 and plain.behind().loops == 0

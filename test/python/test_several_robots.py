@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import EVERY, settled
+from drives import EVERY, loops_by, settled
 from heard import pose3, seconds
 from numpy.testing import assert_allclose, assert_array_equal
-from team import Restarts, Team, fill, loops_by, poses_of
+from team import Restarts, Team, fill, poses_of
 from worlds import between, compose
 
 import l1slam_ros as l1
