@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Several robots in one back end, and several drives of one: their maps, and what joins them."""
+"""Several robots in one back end: their maps, what joins them, and what is saved of them."""
 
 from dataclasses import replace
 
@@ -77,24 +77,6 @@ def test_a_map_of_two_robots_is_saved_and_goes_on():
     assert len(backend.poses) == 120
     with pytest.raises(l1.L1SlamError, match='a map of SE2, expected one of SE3'):
         l1.Backend(EVERY, 3).restore(before.saved())
-
-
-def test_a_robot_comes_late_and_may_be_any():
-    """The second one alone, too: what the map is of is said by its number."""
-    team, backend = Team(lies=0, n=80, edges=240), l1.Backend(EVERY)
-    fill(backend, [(1, team.sample(k)) for k in range(40, 80)])
-    backend.settle()
-    assert backend.robot() is None and backend.robot(1) is not None
-    saved, backend = backend.saved(), l1.Backend(EVERY)
-    backend.restore(saved)
-    assert (backend.snapshot().graph.robot == 1).all()
-    fill(backend, [(0, team.sample(k)) for k in range(40)])
-    fill(backend, [(0, found) for *_, found in team.loops()])
-    backend.settle()
-    assert backend.robot(0).joined
-    assert_allclose(poses_of(backend, 0)[0], [0.0, 0.0, 0.0], atol=1e-12)
-    for robot in (0, 1):
-        assert team.error(poses_of(backend, robot), robot) < 0.7
 
 
 def test_a_reset_by_one_robot_is_one_for_all():
@@ -179,48 +161,3 @@ def test_a_new_part_stands_where_its_robot_was_and_goes_with_it(joined_first):
     settled(backend)
     truth = team.truth[team.robot == 2]
     assert_allclose(guess(), between(truth[at - 1], truth[at]), atol=0.2)
-
-
-# Drives of several days
-
-_DAY = seconds(86400)
-_FAR = np.array([500.0, 300.0, 1.0])
-# Loops of one day that agree on a turned and moved map, between keyframes of it.
-_LIES, _MOVED = [(k, 80 + k) for k in range(6)], np.array([0.9, -0.6, 0.06])
-
-
-def test_a_drive_from_elsewhere_joins_the_loaded_map_and_what_that_believed_is_doubted():
-    """The halves of a world are drives of one robot, of which the first one ends with lies."""
-    team, backend = Team(n=240, edges=840, lies=100), l1.Backend(EVERY)
-    *_, (_, _, like) = team.loops()
-    like = replace(like, robot=0, reference_robot=None)
-    fill(backend, [(0, team.sample(k)) for k in range(120)])
-    for i, j in _LIES:
-        seen = between(team.truth[i], compose(_MOVED, team.truth[j]))
-        backend.add_loop(replace(like, reference_stamp=team.stamp(i), stamp=team.stamp(j),
-                                 pose3=pose3(seen)))
-    backend.settle()
-    lies = {(0, 0, team.stamp(i), team.stamp(j)) for i, j in _LIES}
-    assert loops_by(backend, 'accepted') == lies
-    before, backend = backend, l1.Backend(EVERY)
-    backend.restore(before.saved())
-    assert_allclose(backend.poses, before.poses, atol=1e-9)
-    for k in range(120, 240):
-        sample = team.sample(k)
-        backend.add_odometry(replace(sample, stamp=sample.stamp + _DAY,
-                                     pose3=pose3(compose(_FAR, team.odometry[k]))))
-        backend.update(0.0)
-    for *_, found in team.loops():
-        if found.robot == 1:
-            reference, stamp = (stamp + _DAY * day for day, stamp in zip(
-                found.robots, found.stamps, strict=True))
-            backend.add_loop(replace(found, reference_stamp=reference, stamp=stamp, robot=0,
-                                     reference_robot=None))
-            backend.update(0.0)
-    backend.settle()
-    assert backend.snapshot().graph.firsts.tolist() == [120]
-    assert backend.counts().told == {'new_part': 1}
-    believed = loops_by(backend, 'accepted')
-    assert len(believed) > 300 and not lies & believed
-    truth = between(np.broadcast_to(team.truth[0], (240, 3)), team.truth)
-    assert np.abs(backend.poses - truth)[:, :2].max() < 0.7
