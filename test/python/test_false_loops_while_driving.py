@@ -80,14 +80,14 @@ def wrong(world, backend):
 
 
 @pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])
-def test_no_lie_is_believed_at_any_time(spoilt, world, clean_errors, kind):
-    """With 30% of the loops false the map never bends, and the loops believed are batch's."""
+def test_no_false_loop_is_accepted_at_any_time(spoilt, world, clean_errors, kind):
+    """With 30% of them false the map never bends, and at rest it is that of the batch."""
     bad, backend = spoilt(kind), l1.Backend(EVERY)
     np.testing.assert_array_equal(bad.truth, world.truth)
 
     def look():
-        lies, _, refused = wrong(bad, backend)
-        assert lies == 0 and refused <= 0.01 * (N + 1) + 1
+        false, _, refused = wrong(bad, backend)
+        assert false == 0 and refused <= 0.01 * (N + 1) + 1
 
     errors = errors_on_the_way(bad, backend, look)
     assert (errors < 1.2 * clean_errors + 0.1).all()
@@ -103,7 +103,7 @@ def test_no_lie_is_believed_at_any_time(spoilt, world, clean_errors, kind):
 
 
 def test_at_rest_all_is_judged_from_the_graph_alone(world, clean_errors):
-    """While driving a slip is not looked for, and what was believed of it stays."""
+    """While driving a slip is not looked for, and what was accepted beside it stays."""
     factors, measurement = world.graph.between, world.graph.between.measurement.copy()
     measurement[factors.step_to[151], 2] += 0.8
     slipped = World(remeasured(world.graph, measurement), world.truth, set())
@@ -115,15 +115,15 @@ def test_at_rest_all_is_judged_from_the_graph_alone(world, clean_errors):
     assert error_of(backend, world.truth) < 1.2 * clean_errors[-1] + 0.1
 
 
-def test_who_doubts_again_lets_go_of_lies_without_being_told_to(spoilt):
+def test_false_loops_in_the_map_are_rejected_once_loops_are_judged(spoilt):
     bad = spoilt('random')
     backend = played(bad.graph, options=CREDULOUS)
     settled(backend)
     assert set(states(backend).values()) == {'accepted'}
     backend.set_options(EVERY)
     settled(backend)
-    lies, lost, _ = wrong(bad, backend)
-    assert lies == 0 and lost <= 2
+    false, lost, _ = wrong(bad, backend)
+    assert false == 0 and lost <= 2
     backend.set_options(CREDULOUS)
     assert set(states(backend).values()) == {'accepted'}
 
@@ -153,7 +153,7 @@ def test_a_person_has_the_last_word(world):
     assert states(backend)[ends] == 'accepted'
 
 
-def test_a_loop_is_suspect_until_another_vouches_for_it():
+def test_a_loop_that_could_be_chance_is_suspect_until_another_confirms_it():
     """On a round whose odometry drifts so far that one loop back to its start could be chance."""
     noise, rng = np.array([0.3, 0.3, 0.03]), np.random.default_rng(0)
     step, truth = np.array([1.0, 0.0, 2 * np.pi / 200]), np.zeros((220, 3))
@@ -179,8 +179,8 @@ def test_a_loop_is_suspect_until_another_vouches_for_it():
     assert error_of(backend, truth) < 0.5 * drifted
 
 
-def test_a_run_of_lies_that_comes_first_bends_no_map_before_the_robot_stands(datasets):
-    """Bicocca begins with eleven lies, and hardly a true loop."""
+def test_a_run_of_false_loops_that_comes_first_bends_no_map_before_the_robot_stands(datasets):
+    """Bicocca begins with eleven of them, and hardly a true loop."""
     graph, _ = l1.read_graph(datasets / 'real' / 'bicocca25b_0.150.g2o')
     backend = played(graph, 0, 1600)
     chain = odometry_of(graph)[:1600]
