@@ -100,7 +100,6 @@ def test_in_the_background_what_comes_is_judged_and_the_threads_end(graph):
         assert np.abs(whitened(graph, backend.poses)).sum() < 1.01 * best
         # A map that takes the place of another is woken for too.
         backend.restore(backend.saved())
-        assert not backend.behind().at_rest
         wait_until(lambda: backend.behind().at_rest)
         assert threading.active_count() > before
     assert threading.active_count() == before

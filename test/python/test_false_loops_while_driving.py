@@ -184,10 +184,9 @@ def test_a_run_of_false_loops_that_comes_first_bends_no_map_before_the_robot_sta
     graph, _ = l1.read_graph(datasets / 'real' / 'bicocca25b_0.150.g2o')
     backend = played(graph, 0, 1600)
     chain = odometry_of(graph)[:1600]
-    for _ in range(2):
-        assert backend.update(PLENTY) is not None
-        assert len(loops_by(backend, 'accepted')) == 0 and backend.behind().loops == 0
-        assert error_of(backend, chain) < 1e-6
+    backend.update(PLENTY)
+    assert len(loops_by(backend, 'accepted')) == 0 and backend.behind().loops == 0
+    assert error_of(backend, chain) < 1e-6
     time.sleep(2.0)  # it stands
     settled(backend)
     assert len(loops_by(backend, 'accepted')) > 10 and error_of(backend, chain) > 1.0
