@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from drives import covariances_of, odometry_of, simulated
+from backends import covariances_of, odometry_of, simulated
 from heard import UNKNOWN, seconds
 from records import information_of
 

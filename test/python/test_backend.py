@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import (
+from backends import (
     CREDULOUS,
     EVERY,
     EVERY_MESSAGE,

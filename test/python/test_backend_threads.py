@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 import pytest
-from drives import EVERY, drive, play, played, settled, simulated, states
+from backends import EVERY, drive, play, played, settled, simulated, states
 from heard import loop
 from worlds import whitened
 

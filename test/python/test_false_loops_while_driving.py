@@ -14,7 +14,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from drives import (
+from backends import (
     CREDULOUS,
     EVERY,
     PLENTY,

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import EVERY, loops_by, settled
+from backends import EVERY, loops_by, settled
 from heard import pose3, seconds
 from numpy.testing import assert_allclose, assert_array_equal
 from team import Restarts, Team, fill, poses_of
