@@ -8,102 +8,120 @@
 # SPDX-License-Identifier: Apache-2.0
 """A world that several robots drive, each with odometry of its own, and messages of theirs."""
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
-from problems import seconds
+from backends import covariances_of, odometry_of, simulated
+from heard import UNKNOWN, seconds
+from records import information_of
 
-from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.graph.parts import give_to
-from l1slam_ros.core.robust.batch import robust_solve
-from l1slam_ros.core.running.snapshot import ACCEPTED
-from l1slam_ros.core.worlds.false_loops import random_false_loops
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
-
-UNKNOWN = np.zeros((6, 6))
+import l1slam_ros as l1
 
 
 class Team:
-    """
-    A world driven by robots, each a share of it, with odometry of its own, and lies.
-
-    graph : as one file has it, one robot behind the other
-    """
+    """A world driven by robots, each a share of it, with odometry of its own, and lies."""
 
     def __init__(self, n=400, edges=1400, lies=300, seed=3, robots=2, world='streets'):
-        options = WorldOptions(odometry_sigma_rotation=0.005)
-        rng = np.random.default_rng(seed)
-        world = simulate_world(n, edges, options, rng, world)
-        if lies:
-            world = with_false_loops(world, random_false_loops(
-                world.graph, world.truth, lies, rng))
-        self.half, whole = n // robots, world.graph.between
-        self.robot = np.minimum(np.arange(n) // self.half, robots - 1)
-        seam = (whole.j == whole.i + 1) & (np.diff(self.robot)[whole.i.clip(0, n - 2)] > 0)
-        graph, self.manifold = world.graph.subset(~seam), world.graph.manifold
-        self.graph = FactorGraph(self.manifold, 0)
-        self.graph.add_poses(n)
-        give_to(self.graph, self.robot)
-        f = graph.between
-        self.graph.append_between(f.i, f.j, f.measurement, f.sqrt_information)
-        self.truth, self.factors = world.truth, self.graph.between
-        self.odometry = self.manifold.identity(n)
-        steps = self.factors.step_to
-        for k in range(n):
-            if steps[k] >= 0:
-                self.odometry[k] = self.manifold.compose(
-                    self.odometry[k - 1:k], self.factors.measurement[steps[k]][None])[0]
+        false = ('--false-loops', lies) if lies else ()
+        with tempfile.TemporaryDirectory() as name:
+            whole = simulated(Path(name), n, edges, '--seed', seed, '--world', world, *false)
+        self.share = n // robots
+        self.robot = np.minimum(np.arange(n) // self.share, robots - 1)
+        self.truth, self.manifold = whole.truth, whole.graph.manifold
+        factors = whole.graph.between
+        seam = factors.is_odometry & (np.diff(self.robot)[factors.i.clip(0, n - 2)] > 0)
+        self._measured = whole.graph.subset(~seam)
+        graph = self._graph()
+        self._factors, self._covariances = graph.between, covariances_of(graph)
+        self.odometry = odometry_of(graph)
+
+    def _graph(self, firsts=()):
+        """Return the graph of all; firsts : keyframes at which a robot begins anew."""
+        factors, graph = self._measured.between, l1.FactorGraph(self.manifold)
+        for k, robot in enumerate(self.robot.tolist()):
+            graph.add_poses(1, robot, begins_part=k in firsts)
+        known = ~(factors.is_odometry & np.isin(factors.j, firsts))
+        graph.add_between(factors.i[known], factors.j[known], factors.measurement[known],
+                          information_of(self._measured)[known])
+        return graph
+
+    def number(self, k):
+        """Return which keyframe of its robot one is."""
+        return k % self.share
 
     def stamp(self, k):
-        return seconds(10 + k % self.half)
+        return seconds(10 + self.number(k))
 
     def sample(self, k):
-        step, cov = self.factors.step_to[k], UNKNOWN
-        if step >= 0:
-            cov = self.covariance(step)
-        pose3 = self.manifold.to_pose3(self.odometry[k:k + 1])[0]
-        return OdometrySample(self.stamp(k), pose3, cov, UNKNOWN)
-
-    def covariance(self, row):
-        """Return that of a factor, as a message states it."""
-        root, rows = self.factors.sqrt_information[row], np.array(self.manifold.COVARIANCE_ROWS)
-        whole = np.zeros((6, 6))
-        whole[rows[:, None], rows] = np.linalg.inv(root.T @ root)
-        return whole
+        step = self._factors.step_to[k]
+        return l1.OdometrySample(
+            self.stamp(k), self.manifold.to_pose3(self.odometry[k:k + 1])[0],
+            self._covariances[step] if step >= 0 else UNKNOWN, UNKNOWN)
 
     def loops(self):
-        """Yield rows of loops, and them."""
-        for row in np.flatnonzero(~self.factors.is_odometry):
-            i, j = self.factors.i[row], self.factors.j[row]
-            yield i, j, LoopClosure(
+        """Yield the keyframes of loops, and them."""
+        factors = self._factors
+        for row in np.flatnonzero(~factors.is_odometry):
+            i, j = factors.i[row], factors.j[row]
+            yield i, j, l1.LoopClosure(
                 self.stamp(i), self.stamp(j),
-                self.manifold.to_pose3(self.factors.measurement[row:row + 1])[0],
-                self.covariance(row), robot=int(self.robot[j]),
+                self.manifold.to_pose3(factors.measurement[row:row + 1])[0],
+                self._covariances[row], robot=int(self.robot[j]),
                 reference_robot=int(self.robot[i]))
 
     def messages(self, late=0):
         """Return (robot, message) as they come, those of the second robot so much later [s]."""
-        events = [((k % self.half) + late * self.robot[k], 0, int(self.robot[k]), self.sample(k))
-                  for k in range(len(self.robot))]
-        events += [(max(i % self.half + late * self.robot[i], j % self.half + late * self.robot[
-            j]), 1, int(self.robot[j]), found) for i, j, found in self.loops()]
+        def when(k):
+            return self.number(k) + late * self.robot[k]
+
+        events = [(when(k), 0, int(self.robot[k]), self.sample(k)) for k in range(len(self.robot))]
+        events += [(max(when(i), when(j)), 1, int(self.robot[j]), found)
+                   for i, j, found in self.loops()]
         return [event[2:] for event in sorted(events, key=lambda event: event[:2])]
 
-    def fill(self, backend, late=0):
-        for robot, message in self.messages(late):
-            if isinstance(message, LoopClosure):
-                backend.add_loop(message)
-            else:
-                backend.add_odometry(message, robot)
+    def believed(self, firsts=()):
+        """
+        Return what the batch solver believes: robots and stamps of loops.
 
-    def believed(self):
-        """Return what the batch solver believes: robots and stamps of loops."""
-        rows = robust_solve(self.graph)[0].accepted & ~self.factors.is_odometry
+        firsts : keyframes at which robots begin anew, as far as it knows
+        """
+        graph = self._graph(firsts)
+        rows = l1.solve(graph).inliers & ~graph.between.is_odometry
         return {(int(self.robot[i]), int(self.robot[j]), self.stamp(i), self.stamp(j))
-                for i, j in zip(self.factors.i[rows], self.factors.j[rows], strict=True)}
+                for i, j in graph.between.pairs[rows]}
+
+    def error(self, poses, robot, seen_from=0):
+        """Return how far positions of a robot are off at most, as a keyframe sees them [m]."""
+        truth = self.truth[self.robot == robot]
+        truth = self.manifold.between(np.broadcast_to(self.truth[seen_from], truth.shape), truth)
+        off = self.manifold.positions(poses) - self.manifold.positions(truth)
+        return np.abs(off).max()
 
 
-def believed_by(now):
-    """Return what a snapshot of a back end believes: robots and stamps of loops."""
-    states, robots = now.loop_states(), now.loop_robots[0]
-    return {(*robots[row].tolist(), *states.stamps[row].tolist())
-            for row in np.flatnonzero(states.state[:len(robots)] == ACCEPTED)}
+class Restarts(Team):
+    """Three robots, of which 1 and 2 begin again at some keyframe, far off in their odometry."""
+
+    def __init__(self, at, **of_team):
+        super().__init__(robots=3, **of_team)
+        far = np.linspace(0.3, 0.1, self.manifold.TANGENT_SIZE)
+        far[:2] = 300.0, 200.0
+        far = self.manifold.retract(self.manifold.identity(1), far[None])
+        self.firsts = [robot * self.share + at for robot in (1, 2)]
+        for first in self.firsts:
+            part = self.odometry[first:first - at + self.share]
+            part[:] = self.manifold.compose(np.broadcast_to(far, part.shape), part)
+
+
+def fill(backend, messages):
+    """Let a back end hear of messages, (robot, message) each."""
+    for robot, message in messages:
+        if isinstance(message, l1.LoopClosure):
+            backend.add_loop(message)
+        else:
+            backend.add_odometry(message, robot)
+
+
+def poses_of(backend, robot):
+    """Return the keyframes of a robot in the map that it is in, (k, p)."""
+    return backend.snapshot().poses_in_map(robot)[1]
