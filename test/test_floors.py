@@ -172,8 +172,10 @@ def inside(path):
 
 
 PRIVATE = {name for module in FILES for node in ast.walk(tree(module))
-           for name in (getattr(node, 'attr', ''), getattr(node, 'name', ''))
-           if name and name.startswith('_') and not name.endswith('__')}
+           if isinstance(node, ast.FunctionDef | ast.ClassDef)
+           or isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store)
+           if (name := getattr(node, 'name', '') or getattr(node, 'attr', '')
+               or getattr(node, 'id', '')).startswith('_') and not name.endswith('_')}
 # Beside the package itself: the command, and the nodes that the executables start.
 DOORS = {f'{PACKAGE}.{name}' for name in (
     'cli.main', 'cli.main.main', 'ros.node', 'ros.node.BackendNode', 'ros.scans.node',
