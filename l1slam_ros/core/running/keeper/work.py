@@ -61,7 +61,7 @@ def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
     solver = keeper.solver
     whole = now.problem()
     pending = now.state.pending
-    looked = now.looked
+    looked, began = now.looked, now.state.began
     del now  # holds the factors of a front that may be replaced meanwhile
     problem = as_one(whole)
     if pending is None:
@@ -75,23 +75,31 @@ def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
     check()
     front = front_of(problem, improvement.poses, looked, check)
     looks = [] if front is None else _caught_up(
-        keeper, front, whole.judgement.accepted, pending is not None, check)
+        keeper, began, front, whole.judgement.accepted, pending is not None, check)
     check()
     keeper.adopt(improvement.of_all(whole), front, pending, looks)
 
 
-def _caught_up(keeper: Keeper, front: Front, part: Mask, again: bool, check: Check) -> list[Look]:
+def _caught_up(keeper: Keeper, began: int, front: Front, part: Mask, again: bool,
+               check: Check) -> list[Look]:
     """
     Let a new front take what came while it was made; return what it says of that.
 
     What came during one pass is left to the next one, as long as that is less than it was: what is
-    left at the end is left to an update, for which a caller waits. part, again : see
-    `FactorTable.for_new_front`
+    left at the end is left to an update, for which a caller waits. began : names the map; part,
+    again : see `FactorTable.for_new_front`
+
+    Raises
+    ------
+    Interrupted : another map has begun.
+
     """
     looks = list[Look]()
     left = np.inf
     while not front.closed:
         state, factors, _ = keeper.look()
+        if state.began != began:
+            raise Interrupted
         what = state.table.for_new_front(factors, part, again)
         before, left = left, len(what) - front.rows
         if not 0 < left < before:
