@@ -235,7 +235,7 @@ def failing(tree: Path, tests: list[str], seconds: float, variables: dict[str, s
             return None
     named = [line.split(' ', 1)[1].split(' - ')[0] for line in printed.splitlines()
              if line.startswith(('FAILED ', 'ERROR '))]
-    return named[0] if named else None if process.returncode in (0, 5) else 'the run itself'
+    return named[0] if named else None if process.returncode in (0, 4, 5) else 'the run itself'
 
 
 def run(tree: Path, mutants: list[Mutant], covered: Path, jobs: int, seconds: float
