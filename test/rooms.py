@@ -178,12 +178,11 @@ def write_log(path, scans, wheels):
     path.write_text('\n'.join(lines) + '\n')
 
 
-def write_scan_bag(path, scans, wheels, mount=None, again=0):
+def write_scan_bag(path, scans, wheels, mount=None):
     """
     Write scans, odometry twice as often and where the laser is, by an independent writer.
 
-    The recorder's clock goes on, whatever the stamps of the scans do. again : so often odometry
-    comes again at the stamp of each scan
+    The recorder's clock goes on, whatever the stamps of the scans do.
     """
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types
@@ -221,8 +220,7 @@ def write_scan_bag(path, scans, wheels, mount=None, again=0):
                     types['geometry_msgs/msg/Transform'](vector(x, y, z), quaternion(*q)))]))
         for k, (scan, pose) in enumerate(zip(scans, wheels, strict=True)):
             now = scans[0].stamp + k * int(_PERIOD * 1e9)
-            for _ in range(1 + again):
-                put('/wheels', now, odometry(scan.stamp, pose))
+            put('/wheels', now, odometry(scan.stamp, pose))
             put('/scan', now, types['sensor_msgs/msg/LaserScan'](
                 header(scan.stamp, 'laser'), scan.angle_min, 6.28, scan.angle_increment,
                 scan.time_increment, 0.2, scan.range_min, scan.range_max,

@@ -127,12 +127,9 @@ def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys,
 
 
 def test_a_graph_too_dense_to_judge_is_solved_as_far_as_it_was_judged(
-        capsys, world, monkeypatch):
+        capsys, world, machine):
     """With little free memory: the odometry alone can be factored, all loops cannot."""
-    read_text = Path.read_text
-    monkeypatch.setattr(Path, 'read_text', lambda path, *more, **options: (
-        'MemAvailable: 400 kB' if str(path) == '/proc/meminfo' else read_text(
-            path, *more, **options)))
+    machine({'/proc/meminfo': 'MemAvailable: 400 kB'})
     for robust in ((), ('--robust',)):
         report = json.loads(run(capsys, 'solve', world, '--json', *robust, code=4)[0])
         assert report['status'] == 'doubtful' and report['suspect'] and not report['rejected']

@@ -13,7 +13,7 @@ import re
 import numpy as np
 import pytest
 from command import run, solve_json
-from worlds import edited, false_of, made
+from worlds import edited, made
 
 
 @pytest.fixture(scope='module')
@@ -69,18 +69,6 @@ def test_what_states_the_identity_is_told_with_the_noise_that_was_found(capsys, 
     # Where the odometry alone states the identity, nothing of the kind is said of loops.
     said = run(capsys, 'solve', told(tmp_path / 'a.g2o', world, identity=(True,)), code=None)[0]
     assert re.findall('the information of the (.*) is the identity', said) == ['odometry']
-
-
-@pytest.mark.parametrize('count, more', [(20, []), (21, ['  and 1 more; `--json` lists all'])])
-def test_of_many_refused_loops_the_worst_twenty_are_named(capsys, tmp_path, count, more):
-    path = made(tmp_path / 'a.g2o', 150, 250, '--seed', 7, '--false-loops', count)
-    said = run(capsys, 'solve', path)[0].splitlines()
-    at = said.index(f'{count} of {101 + count} loops refused')
-    named = [re.fullmatch(r'  (\d+) - (\d+): (\d+\.\d) sigmas off the accepted ones', line)
-             for line in said[at + 1 : at + 21]]
-    sigmas = [float(match[3]) for match in named]
-    assert sigmas == sorted(sigmas, reverse=True) and said[at + 21 :] == more
-    assert {(int(match[1]), int(match[2])) for match in named} <= {*map(tuple, false_of(path))}
 
 
 def test_suspects_are_counted_apart(capsys, tmp_path):

@@ -95,23 +95,6 @@ def test_a_clock_that_is_set_back_within_a_bag_is_one_clock_again(drive, tmp_pat
     assert {**found, 'seconds': 0, 'warnings': []} == {**said, 'seconds': 0}
 
 
-def test_odometry_that_comes_twice_with_the_first_scan_is_used_once(drive, tmp_path, capsys):
-    scans, wheels = drive[0][:20], drive[1][:20]
-    once, twice = tmp_path / 'once', tmp_path / 'twice'
-    write_scan_bag(once, scans, wheels)
-    write_scan_bag(twice, scans, wheels, again=3)
-    reports, paths = [], []
-    for bag in once, twice:
-        output = tmp_path / f'{bag.name}.tum'
-        code, said = solved(capsys, bag, '--scans', '/scan', '--odom-topic', '/wheels',
-                            '--output', output)
-        assert code == 0 and said['poses'] == 5
-        reports.append({**said, 'seconds': 0})
-        paths.append(np.loadtxt(output))
-    assert reports[0] == reports[1]
-    np.testing.assert_array_equal(*paths)
-
-
 def test_the_scans_of_a_bag_bear_the_velocity_of_the_wheels_meanwhile(drive, tmp_path, capsys):
     """Of scans taken while it drives the map is good where they say how long they lasted."""
     scans, wheels, true = (part[:101] for part in drive)
