@@ -12,40 +12,24 @@ import re
 import shlex
 
 import pytest
-from command import help_of, run, texts_of
+from command import help_of, run
 from worlds import graph_file
 
 VERTICES = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 1 1 0 0', 'VERTEX_SE2 2 2 0 0']
 EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
          'EDGE_SE2 0 2 2.1 0 0 1 0 0 1 0 1']
-AFTER_GAP = 'EDGE_SE2 2 3 1 0 0 1 0 0 1 0 1'
 
 
 def test_info_of_a_good_graph_and_of_its_bag(capsys, world, tmp_path):
-    out, err = run(capsys, 'info', world)
-    assert out.endswith('\nnothing looks wrong\n') and err == ''
     run(capsys, 'convert', world, tmp_path / 'bag')
-    out, _ = run(capsys, 'info', tmp_path / 'bag')
-    for row in ('duration    14.9 s from 1000.000000000',
-                'note        covariance increment, keyframes every',
-                'topic       /loop_closures: 101 of geometry_msgs/msg/PoseWithCovarianceStamped',
-                'topic       /odom: 150 of nav_msgs/msg/Odometry', 'poses       150 in SE2',
-                'time        14.9 s', 'nothing looks wrong'):
-        assert f'\n{row}' in f'\n{out}', out
+    for path in world, tmp_path / 'bag':
+        out, err = run(capsys, 'info', path)
+        assert out.endswith('\nnothing looks wrong\n') and err == ''
 
 
 def test_info_says_what_was_skipped(capsys, tmp_path):
     out, err = run(capsys, 'info', graph_file(tmp_path, [*VERTICES, *EDGES, 'VERTEX_XY 9 1 2']))
     assert "- 1 line not used: 1 'VERTEX_XY' (landmarks" in out and err == ''
-
-
-def test_plot_draws_several_maps_with_false_loops_where_they_are_known(capsys, world, tmp_path):
-    run(capsys, 'corrupt', world, tmp_path / 'bad.g2o', '--false-loops', 12)
-    run(capsys, 'plot', world, world, tmp_path / 'bad.g2o', '--output', tmp_path / 'maps.svg')
-    said = texts_of(tmp_path / 'maps.svg')
-    assert said.count('world.g2o') == said.count('truth') == 2 and said.count('odometry') == 3
-    assert said.count('false loops') == 1 and said.count('bad.g2o') == 1
-    assert '150 poses, 101 loops' in said and '150 poses, 113 loops (12 false)' in said
 
 
 @pytest.mark.parametrize('command, output', [('plot', '--output'), ('solve', '--plot')])
@@ -95,7 +79,7 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     (tmp_path / 'graph.txt').write_text('{}')
     for name in ('other', 'taken.g2o', 'taken.png'):
         (tmp_path / name).mkdir()
-    (tmp_path / 'gap.g2o').write_text('\n'.join([EDGES[0], AFTER_GAP, EDGES[2]]))
+    (tmp_path / 'gap.g2o').write_text('\n'.join([EDGES[0], 'EDGE_SE2 2 3 1 0 0 1 0 0 1 0 1', EDGES[2]]))
     (tmp_path / 'nan.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 1 2 nan '))
     (tmp_path / 'lonely.g2o').write_text('\n'.join([*VERTICES, 'VERTEX_SE2 9 0 0 0', *EDGES]))
     there = sorted(tmp_path.iterdir())

@@ -14,12 +14,12 @@ import json
 import os
 import pty
 import re
-import select
 import struct
 import subprocess
 import sys
 import termios
 import time
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -172,24 +172,15 @@ def on_a_terminal(*arguments, **options):
     """Run the command with standard error on a terminal; return what it showed there."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 80, 0, 0))
-    process = subprocess.Popen([sys.executable, '-c', RUN, *map(str, arguments)], stderr=theirs,
-                               stdout=subprocess.DEVNULL, cwd=ROOT, **options)
+    process = subprocess.Popen(['timeout', str(DEADLINE), sys.executable, '-c', RUN,
+                                *map(str, arguments)], stderr=theirs, stdout=subprocess.DEVNULL,
+                               cwd=ROOT, **options)
     os.close(theirs)
-    shown, deadline = b'', time.monotonic() + DEADLINE
-    try:
-        while time.monotonic() < deadline:
-            if select.select([ours], [], [], 1.0)[0]:
-                try:
-                    news = os.read(ours, 4096)
-                except OSError:  # its other end is closed
-                    break
-                if not news:
-                    break
-                shown += news
-    finally:
-        os.close(ours)
-        process.kill()
-        process.wait()
+    shown = b''
+    with open(ours, 'rb', buffering=0) as screen, suppress(OSError):  # its other end is closed
+        while news := screen.read(4096):
+            shown += news
+    assert process.wait() == 0
     return shown.decode()
 
 

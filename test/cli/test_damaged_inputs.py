@@ -13,7 +13,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from command import run, solve_json
+from command import run
 
 SCAN = 'FLASER 4 1 2 3 4 {k}.04 2 0 {k} 2 0 {k} host 0.1\n'
 
@@ -46,14 +46,6 @@ def test_a_scan_of_a_stamp_that_no_clock_has_is_left_out(capsys, tmp_path, stamp
     path.write_bytes(log(40) + SCAN.format(k=7).replace(' 7 host', f' {stamp} host').encode())
     _, err = run(capsys, 'info', path, code=3)
     assert 'line 41: expected FLASER' in err and err.count('\n') == 1
-
-
-@pytest.mark.parametrize('norm', ['l2', 'huber', 'group-l1'])
-def test_a_drive_without_a_loop_has_a_norm_for_loops(capsys, tmp_path, norm):
-    path = tmp_path / 'drive.g2o'
-    path.write_text(''.join(f'EDGE_SE2 {k} {k + 1} 1 0 .1 9 0 0 9 0 9\n' for k in range(9)))
-    report = solve_json(capsys, path, '--loop-norm', norm)
-    assert report['status'] == 'converged' and report['final_cost'] < 1e-6
 
 
 def drive_that_goes_on_far_off(path, metres):

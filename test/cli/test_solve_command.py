@@ -158,8 +158,9 @@ def test_absolute_poses_are_no_loops_but_doubted_too(capsys, world):
     assert f'{len(report["rejected"])} of 101 loops and 2 absolute poses refused\n' in out
 
 
-def test_a_graph_without_loops_is_its_odometry(capsys, tmp_path):
-    report = solve_json(capsys, graph_file(tmp_path, EDGES[:2]))
+@pytest.mark.parametrize('norm', ['same', 'l2', 'huber', 'group-l1'])
+def test_a_graph_without_loops_is_its_odometry(capsys, tmp_path, norm):
+    report = solve_json(capsys, graph_file(tmp_path, EDGES[:2]), '--loop-norm', norm)
     assert report['status'] == 'converged' and report['final_cost'] < 1e-6
     assert report['warnings'] == report['rejected'] == report['suspect'] == []
     lines = run(capsys, 'solve', tmp_path / 'graph.g2o')[0].splitlines()
