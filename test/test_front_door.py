@@ -121,13 +121,6 @@ def test_a_start_of_long_quaternions_is_the_same_start(tmp_path):
     np.testing.assert_allclose(twice, once, atol=1e-9)
 
 
-def test_what_a_file_says_in_vain_is_warned_of(world):
-    path = world.parent / 'fixed.g2o'
-    path.write_text(f'{world.read_text()}FIX 5\n')
-    with pytest.warns(UserWarning, match="FIX '5' is not used"):
-        l1.read_graph(path)
-
-
 @pytest.mark.parametrize('call, said', [
     (lambda graph, _: l1.solve('world.g2o'),
      "graph is 'world.g2o', expected a FactorGraph, as read_graph returns first"),

@@ -13,7 +13,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from command import run
+from command import run, solve_json
 
 SCAN = 'FLASER 4 1 2 3 4 {k}.04 2 0 {k} 2 0 {k} host 0.1\n'
 
@@ -46,6 +46,16 @@ def test_a_scan_of_a_stamp_that_no_clock_has_is_left_out(capsys, tmp_path, stamp
     path.write_bytes(log(40) + SCAN.format(k=7).replace(' 7 host', f' {stamp} host').encode())
     _, err = run(capsys, 'info', path, code=3)
     assert 'line 41: expected FLASER' in err and err.count('\n') == 1
+
+
+@pytest.mark.parametrize('information', ['1e-30', '1e30'])
+def test_any_information_that_is_read_can_be_given(capsys, tmp_path, information):
+    path = tmp_path / 'bare.g2o'
+    ends = [(k, k + 1) for k in range(39)] + [(k, k + 20) for k in range(0, 19, 3)]
+    path.write_text(''.join(
+        f'EDGE_SE2 {i} {j} {int(j - i == 1)} 0 {1.5708 if j - i == 1 and i % 5 == 4 else 0}\n'
+        for i, j in ends))
+    assert solve_json(capsys, path, '--information', information, code=None)['poses'] == 40
 
 
 def drive_that_goes_on_far_off(path, metres):

@@ -108,8 +108,8 @@ GAP = 'no edge between the consecutive vertices 1 and 2, so no chain of odometry
 @pytest.mark.parametrize('start', ['seed', 'file'])
 def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys, tmp_path, start):
     vertices = [f'VERTEX_SE2 {k} {k} 0 0' for k in range(4)]
-    path = graph_file(tmp_path, vertices + [
-        f'EDGE_SE2 {i} {j} {x} 0 0 1 0 0 1 0 1' for i, j, x in ((0, 1, 1), (2, 3, 1), (0, 2, 2.1))])
+    edges = [f'EDGE_SE2 {ends} 0 0 1 0 0 1 0 1' for ends in ('0 1 1', '2 3 1', '0 2 2.1')]
+    path = graph_file(tmp_path, vertices + edges)
     asked = ['solve', path, '--start', start, '--json', '--output', tmp_path / 'out.g2o']
     out, err = run(capsys, *asked, '--robust', code=4)
     report = json.loads(out)

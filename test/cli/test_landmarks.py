@@ -102,14 +102,6 @@ def test_a_false_first_sighting_is_refused_as_any(tmp_path, capsys):
     assert found['slips'] == []
 
 
-@pytest.mark.parametrize('norm', ['l2', 'huber'])
-@SPACE
-def test_each_norm(tmp_path, capsys, norm, space):
-    world = TagWorld(1, 300, 6, 0.0, space)
-    found = solved(capsys, tmp_path, world, '--norm', norm)
-    assert found['ate'] < 0.15 and not left_out(found)
-
-
 def test_info_counts_landmarks_and_finds_no_gap_at_them(tmp_path, capsys):
     TagWorld(0, 300, 6).write(tmp_path / 'tags.g2o', ids=IDS['tags_between'])
     out, _ = run(capsys, 'info', tmp_path / 'tags.g2o')
