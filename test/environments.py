@@ -19,6 +19,7 @@ import hashlib
 import importlib.util
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -70,6 +71,23 @@ def run(*command: object, cwd: Path, env: Mapping[str, str]) -> str:
     assert ran.returncode == 0, (
         f'{" ".join(map(str, command))}: {ran.returncode}\n{ran.stdout}\n{ran.stderr}')
     return ran.stdout
+
+
+@contextmanager
+def running_backend(*command: object, cwd: Path, env: Mapping[str, str],
+                    end: int = signal.SIGTERM) -> Iterator[None]:
+    """Start a node that must become ready; end it by a signal, upon which it must exit with 0."""
+    process = subprocess.Popen([*map(str, command)], cwd=cwd, env=env, stderr=subprocess.PIPE,
+                               text=True, start_new_session=True)
+    try:
+        line = process.stderr.readline()
+        assert 'ready' in line, line
+        yield
+        process.send_signal(end)
+        assert process.wait(60) == 0
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def own_variables(**more: str) -> dict[str, str]:

@@ -159,16 +159,6 @@ def graph_of(truth, pairs, noise=0.0, information=USUAL):
     return graph
 
 
-def retold(graph, measurement=None, times=1.0, trusted=None):
-    """Return the graph with other measurements (m, p), sigmas that many times (m,), trust (m,)."""
-    factors, other = graph.between, l1.FactorGraph(graph.manifold, graph.n_poses)
-    other.append_between(factors.i, factors.j,
-                         factors.measurement if measurement is None else measurement,
-                         factors.sqrt_information / np.reshape(times, (-1, 1, 1)),
-                         factors.trusted if trusted is None else trusted)
-    return other
-
-
 def add_absolute(graph, k, measurement, information):
     """Append absolute factors of keyframes k (m,)."""
     graph.add_between(np.full_like(k, WORLD), k, measurement, information)

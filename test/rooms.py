@@ -150,7 +150,6 @@ def glass(ranges, _, rng, part=0.2):
 
 def laps(count=2, seed=0):
     """Return scans, the wheels' poses and the true ones (n, 3) of some laps round the block."""
-    rng = np.random.default_rng(seed)
     true = []
     for k in range(4 * count):
         a, b = _CORNERS[k % 4], _CORNERS[(k + 1) % 4]
@@ -159,11 +158,7 @@ def laps(count=2, seed=0):
             true.append((*(a + part * (b - a) / np.linalg.norm(b - a)), heading))
         true += [(*b, heading + turn) for turn in np.linspace(0, np.pi / 2, 6)[1:-1]]
     true = np.array(true)
-    wheels = drifting(true, rng)
-    stamps = (1000 * 10**9 + np.arange(len(true)) * int(_PERIOD * 1e9)).tolist()
-    scans = [Scan(stamp, ranges_at(pose, rng), 0.0, 2 * np.pi / _RAYS, 0.05, 30.0)
-             for stamp, pose in zip(stamps, true, strict=True)]
-    return scans, wheels, true
+    return *drive(true, seed), true
 
 
 def write_log(path, scans, wheels):
@@ -178,12 +173,11 @@ def write_log(path, scans, wheels):
     path.write_text('\n'.join(lines) + '\n')
 
 
-def write_scan_bag(path, scans, wheels, mount=None, again=0):
+def write_scan_bag(path, scans, wheels, mount=None):
     """
     Write scans, odometry twice as often and where the laser is, by an independent writer.
 
-    The recorder's clock goes on, whatever the stamps of the scans do. again : so often odometry
-    comes again at the stamp of each scan
+    The recorder's clock goes on, whatever the stamps of the scans do.
     """
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types
@@ -221,8 +215,7 @@ def write_scan_bag(path, scans, wheels, mount=None, again=0):
                     types['geometry_msgs/msg/Transform'](vector(x, y, z), quaternion(*q)))]))
         for k, (scan, pose) in enumerate(zip(scans, wheels, strict=True)):
             now = scans[0].stamp + k * int(_PERIOD * 1e9)
-            for _ in range(1 + again):
-                put('/wheels', now, odometry(scan.stamp, pose))
+            put('/wheels', now, odometry(scan.stamp, pose))
             put('/scan', now, types['sensor_msgs/msg/LaserScan'](
                 header(scan.stamp, 'laser'), scan.angle_min, 6.28, scan.angle_increment,
                 scan.time_increment, 0.2, scan.range_min, scan.range_max,

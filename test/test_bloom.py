@@ -49,8 +49,12 @@ def test_bloom_makes_a_debian_package_of_every_key(index, tmp_path):
     tools = environment('bloom', 'rosdep', 'rosdistro', 'setuptools<80', '--no-binary=empy')
     copy = tmp_path / 'l1slam_ros'
     copy.mkdir()
-    for name in ('package.xml', 'CHANGELOG.rst', 'LICENSE'):
+    for name in ('package.xml', 'LICENSE'):
         shutil.copy(ROOT / name, copy)
+    # As catkin_prepare_release does it.
+    text = (ROOT / 'CHANGELOG.rst').read_text().replace(
+        'Forthcoming\n-----------', '0.1.0 (2026-01-01)\n------------------')
+    (copy / 'CHANGELOG.rst').write_text(text)
     tools.run('rosdistro_build_cache', index['ROSDISTRO_INDEX_URL'], 'jazzy', cwd=tmp_path,
               **index)
     tools.run('rosdep', 'update', '--rosdistro', 'jazzy', cwd=tmp_path, **index)
@@ -60,4 +64,5 @@ def test_bloom_makes_a_debian_package_of_every_key(index, tmp_path):
     assert control.startswith('Source: ros-jazzy-l1slam-ros\n')
     assert 'Maintainer: "l1slam_ros maintainers"' in control
     needed = {word.strip(' ,') for line in control.splitlines() for word in line.split(', ')}
+    assert 'is doubtful' in (copy / 'debian' / 'changelog').read_text()
     assert {PACKAGES[key] for key in ('rclpy', 'nav_msgs', 'python3-numpy')} <= needed

@@ -53,39 +53,25 @@ print(json.dumps([*counts, [2 * graph.error(poses), 2 * graph.error(optimised)]]
 """
 
 
-@pytest.fixture
-def bag(tmp_path):
-    return made(tmp_path / 'world', 300, 500, '--seed', 3)
-
-
-@pytest.fixture
-def evo(tmp_path):
-    """Return a function that runs a command of evo, which writes settings to a home."""
-    made = environment('evo')
-
-    def run_evo(*command):
-        return made.run(*command, cwd=tmp_path, HOME=str(tmp_path), MPLBACKEND='Agg')
-
-    return run_evo
-
-
-def rmse(results):
-    with zipfile.ZipFile(results) as archive:
-        return json.loads(archive.read('stats.json'))['rmse']
-
-
-def test_evo_reads_our_bags_and_finds_the_error_that_we_find(capsys, bag, evo, tmp_path):
+def test_evo_reads_our_bags_and_finds_the_error_that_we_find(capsys, tmp_path):
+    tool, bag = environment('evo'), made(tmp_path / 'world', 300, 500, '--seed', 3)
+    # It writes settings to a home.
+    variables = {'HOME': str(tmp_path), 'MPLBACKEND': 'Agg'}
     run(capsys, 'solve', bag, '--output', tmp_path / 'solved.tum')
     run(capsys, 'convert', bag, tmp_path / 'ours.tum')
-    evo('evo_traj', 'bag2', bag, '/ground_truth', '/odom', '--save_as_tum')
+    tool.run('evo_traj', 'bag2', bag, '/ground_truth', '/odom', '--save_as_tum', cwd=tmp_path,
+             **variables)
     theirs, ours = np.loadtxt(tmp_path / 'odom.tum'), np.loadtxt(tmp_path / 'ours.tum')
     assert theirs.shape == (300, 8)
     assert np.abs(theirs - ours).max() < 1e-9
     truth, positions = np.loadtxt(f'{bag}.truth.txt'), np.loadtxt(tmp_path / 'ground_truth.tum')
     assert np.abs(truth[:, 1:3] - positions[:, 1:3]).max() < 1e-9
-    evo('evo_ape', 'tum', 'ground_truth.tum', 'solved.tum', '--align', '--save_results', 'ape.zip')
+    tool.run('evo_ape', 'tum', 'ground_truth.tum', 'solved.tum', '--align', '--save_results',
+             'ape.zip', cwd=tmp_path, **variables)
+    with zipfile.ZipFile(tmp_path / 'ape.zip') as archive:
+        rmse = json.loads(archive.read('stats.json'))['rmse']
     found = solve_json(capsys, bag, '--reference', tmp_path / 'ground_truth.tum')
-    assert found['ate'] == pytest.approx(rmse(tmp_path / 'ape.zip'), rel=1e-6)
+    assert found['ate'] == pytest.approx(rmse, rel=1e-6)
     assert 0 < found['ate'] < 0.2
 
 

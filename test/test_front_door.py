@@ -20,11 +20,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import solve_json
-from rosbags.rosbag2 import StoragePlugin
-from worlds import false_of, made, simulated_bag
+from worlds import false_of, made
 
 import l1slam_ros as l1
-from bags import recording_of, rosbag2_directory
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / 'README.md').read_text()
@@ -46,7 +44,6 @@ def test_the_import_is_light():
 
 
 def test_the_example_of_the_readme_runs_and_says_what_it_found(world):
-    assert len(EXAMPLE.splitlines()) <= 30
     ran = subprocess.run([sys.executable, '-c', EXAMPLE], cwd=world.parent, capture_output=True,
                          text=True, check=False)
     assert (ran.returncode, ran.stderr) == (0, '')
@@ -54,15 +51,11 @@ def test_the_example_of_the_readme_runs_and_says_what_it_found(world):
     assert len(l1.read_graph(world.parent / 'solved.g2o')[1]) == 200
 
 
-def test_type_checkers_know_every_name_and_each_explains_itself():
+def test_type_checkers_know_every_name():
     found = {alias.name: node.module for node in ast.walk(ast.parse(inspect.getsource(l1)))
              if isinstance(node, ast.ImportFrom) for alias in node.names}
     assert {name: found[name] for name in l1.__all__} == {
         name: getattr(l1, name).__module__ for name in l1.__all__}
-    assert Path(l1.__file__).with_name('py.typed').exists()
-
-
-    assert all(len(inspect.getdoc(getattr(l1, name))) > 30 for name in l1.__all__)
 
 
 def test_the_refused_are_the_false_and_a_start_is_begun_from(world):
@@ -104,23 +97,13 @@ def test_every_door_takes_a_norm_of_loops_alone(world, tmp_path, capsys):
     assert solution.status == 'converged'
 
 
-def test_what_cannot_be_solved_is_said(world):
+def test_poses_that_are_none_are_refused(world):
     graph, poses = l1.read_graph(world)
-    with pytest.raises(l1.L1SlamError, match="norm is 'l3', expected one of l1, group-l1, l2, "):
-        l1.solve(graph, norm='l3')
-    with pytest.raises(l1.L1SlamError, match="loop_norm is 'l3', expected one of same, l1, "):
-        l1.solve(graph, loop_norm='l3')
-    with pytest.raises(l1.L1SlamError, match=r'start has the shape \(3, 3\), expected \(200, 3\)'):
-        l1.solve(graph, start=poses[:3])
     poses[7] = np.nan
     with pytest.raises(l1.L1SlamError, match='start of keyframe 7 is no pose; expected finite'):
         l1.solve(graph, start=poses)
-    with pytest.raises(l1.L1SlamError, match=r'poses have the shape \(3, 3\)'):
-        l1.write_graph(world.parent / 'x.g2o', graph, poses[:3])
     with pytest.raises(l1.L1SlamError, match='pose 7 is .*, expected finite numbers'):
         l1.write_graph(world.parent / 'x.tum', graph, poses)
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        l1.nothing  # noqa: B018
 
 
 @pytest.mark.parametrize('clone', [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
@@ -138,59 +121,32 @@ def test_a_start_of_long_quaternions_is_the_same_start(tmp_path):
     np.testing.assert_allclose(twice, once, atol=1e-9)
 
 
-def test_what_a_file_says_in_vain_is_warned_of(world):
-    path = world.parent / 'fixed.g2o'
-    path.write_text(f'{world.read_text()}FIX 5\n')
-    with pytest.warns(UserWarning, match="FIX '5' is not used"):
-        l1.read_graph(path)
-
-
 @pytest.mark.parametrize('call, said', [
     (lambda graph, _: l1.solve('world.g2o'),
      "graph is 'world.g2o', expected a FactorGraph, as read_graph returns first"),
-    (lambda graph, poses: l1.solve((graph, poses)), 'graph is (<l1slam_ros.'),
     (lambda graph, _: l1.solve(graph, robust='no'), "robust is 'no', expected True or False"),
-    (lambda graph, _: l1.solve(graph, robust=1), 'robust is 1, expected True or False'),
     (lambda graph, _: l1.solve(graph, norm=['l1']), "norm is ['l1'], expected one of l1, "),
+    (lambda graph, _: l1.solve(graph, loop_norm='l3'), "loop_norm is 'l3', expected one of same"),
+    (lambda graph, _: l1.solve(graph, start=np.zeros((3, 3))),
+     'start has the shape (3, 3), expected (200, 3)'),
     (lambda graph, _: l1.solve(graph, start='seed'), 'start has entries that are no numb'),
-    (lambda graph, _: l1.solve(graph, start=[[1, 2], [3]]), 'start has entries that are no numb'),
-    (lambda graph, poses: l1.write_graph('x.g2o', poses, graph), 'graph is array('),
     (lambda graph, _: l1.write_graph('x.g2o', graph, None), 'poses have the shape (), expected'),
-    (lambda graph, poses: l1.write_graph(3, graph, poses), 'path is 3, expected the name of a f'),
     (lambda *_: l1.read_graph(None), 'path is None, expected the name of a file'),
     (lambda *_: l1.read_graph('bag', odom_topic=3), 'odom_topic is 3, expected the name of a top'),
-    (lambda *_: l1.read_graph('bag', loop_topic=['/a']), "loop_topic is ['/a'], expected the na"),
     (lambda *_: l1.Backend({'keyframe': {'translation': 1.0}}),
      "options is {'keyframe': {'translation': 1.0}}, expected BackendOptions; BackendOptions.from_"
      'mapping makes them of a mapping'),
-    (lambda *_: l1.Backend(None), 'options is None, expected BackendOptions; '),
     (lambda *_: l1.Backend(dimension='2'), "dimension is '2', expected 2 or 3"),
-    (lambda *_: l1.Backend(dimension=[2]), 'dimension is [2], expected 2 or 3'),
     (lambda *_: l1.Backend(background='yes'), "background is 'yes', expected True or False"),
-    (lambda *_: l1.Backend().set_options({}), 'options is {}, expected BackendOptions; '),
     (lambda *_: l1.BackendOptions(keyframe={'translation': 1.0}),
      "keyframe is {'translation': 1.0}, expected KeyframeOptions; KeyframeOptions.from_mapping"),
     (lambda *_: l1.BackendOptions.from_mapping({'keyfram': {'translation': 1.0}}),
      'no option is called keyfram.translation'),
-    (lambda *_: l1.BackendOptions.from_mapping({'keyframe': 1.0}), 'no option is called keyframe'),
     (lambda *_: l1.BackendOptions.from_mapping('keyframe'), "options are 'keyframe', expected a"),
     (lambda *_: l1.Backend().add_loop(3), 'the measurement is 3, expected LoopClosure'),
-    (lambda *_: l1.Backend().add_odometry(l1.LoopClosure(1, 2, np.zeros(7), np.eye(6))),
-     'the measurement is LoopClosure('),
 ])
 def test_what_is_of_another_kind_is_refused_by_its_name(world, call, said):
     graph, poses = l1.read_graph(world)
     with pytest.raises(l1.L1SlamError) as caught:
         call(graph, poses)
     assert str(caught.value).startswith(said)
-
-
-def test_a_bag_of_another_robot_is_read_by_its_topics(tmp_path):
-    bag = simulated_bag(tmp_path / 'bag', 60, 100)
-    rosbag2_directory(tmp_path / 'other', [
-        (f'/r1{topic}', *rest) for topic, *rest in recording_of(bag)], StoragePlugin.MCAP)
-    graph, _ = l1.read_graph(tmp_path / 'other', odom_topic='/r1/odom',
-                             loop_topic='/r1/loop_closures')
-    expected, _ = l1.read_graph(bag)
-    np.testing.assert_array_equal(graph.between.pairs, expected.between.pairs)
-    assert (~graph.between.is_odometry).sum() > 30

@@ -9,7 +9,6 @@
 """The launch files: their arguments, and what they start where `launch` is installed."""
 
 import ast
-import re
 from pathlib import Path
 
 import pytest
@@ -17,38 +16,20 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
-ARGUMENTS = {'params_file', 'use_sim_time', 'namespace', 'map', 'rviz'}
 # In place of what is started: writes down its arguments, one a line, and ends.
 RECORDER = '#!/bin/sh\nprintf "%s\\n" "$@" > "$0.started"\n'
 
 
-def declared(file):
-    """Return the arguments that a launch file declares, by name: what is said of each."""
-    calls = [node for node in ast.walk(ast.parse(file.read_text()))
-             if isinstance(node, ast.Call) and getattr(node.func, 'id', '') ==
-             'DeclareLaunchArgument']
-    return {call.args[0].value: {word.arg: word.value for word in call.keywords}
-            for call in calls}
-
-
-def test_there_are_the_files_that_the_pages_name():
-    assert {file.name for file in FILES} == {'backend.launch.py', 'lidar.launch.py'}
-    pages = ''.join(path.read_text() for path in (ROOT / 'README.md', *ROOT.glob('doc/*.md')))
-    named = set(re.findall(r'ros2 launch l1slam_ros ([\w.]+)', pages))
-    assert named == {file.name for file in FILES}
-
-
 @pytest.mark.parametrize('file', FILES, ids=lambda file: file.name)
 def test_each_argument_has_a_default_and_is_documented(file):
-    compile(file.read_text(), file.name, 'exec')
-    found = declared(file)
-    assert found.keys() <= ARGUMENTS
-    if 'IncludeLaunchDescription' not in file.read_text():
-        assert found.keys() == ARGUMENTS
+    """Also where `launch_ros` is not installed, and what is below is skipped."""
     page = (ROOT / 'doc' / 'topics_and_parameters.md').read_text()
-    for name, said in found.items():
-        assert ast.literal_eval(said['description']) and 'default_value' in said
-        assert f'| `{name}` |' in page
+    calls = [node for node in ast.walk(ast.parse(file.read_text()))
+             if getattr(node, 'func', None) and ast.unparse(node.func) == 'DeclareLaunchArgument']
+    assert calls
+    for call in calls:
+        assert {word.arg for word in call.keywords} >= {'default_value', 'description'}
+        assert f'| `{call.args[0].value}` |' in page
 
 
 @pytest.fixture

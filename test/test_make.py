@@ -68,21 +68,14 @@ def test_the_demo_installs_what_it_needs_once_and_the_tests_only_add_to_it(check
     assert make(checkout, 'demo')[:2] == (0, DEMO[1:])
 
 
-@pytest.mark.parametrize('target', ['demo', 'test'])
-def test_what_pip_left_half_done_is_made_anew(checkout, target):
+@pytest.mark.parametrize(('target', 'what'), [
+    ('demo', 'pip-install'), ('test', 'pip-install'), ('demo', 'venv-.venv')])
+def test_what_was_left_half_done_is_made_anew(checkout, target, what):
     if target == 'test':
         make(checkout, 'demo')
-    killed = checkout.parent / 'pip-install-killed'
+    killed = checkout.parent / f'{what}-killed'
     killed.touch()
     assert make(checkout, target)[0]
-    killed.unlink()
-    assert make(checkout, 'demo')[:2] == (0, [VENV, *DEMO])
-
-
-def test_a_half_made_environment_is_made_anew(checkout):
-    killed = checkout.parent / 'venv-.venv-killed'
-    killed.touch()
-    assert make(checkout, 'demo')[0]
     killed.unlink()
     assert make(checkout, 'demo')[:2] == (0, [VENV, *DEMO])
 

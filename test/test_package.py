@@ -13,14 +13,11 @@ import json
 import os
 import re
 import shutil
-import signal
 import stat
 import subprocess
 import sys
 import sysconfig
-import tarfile
 import zipfile
-from contextlib import contextmanager
 from email import message_from_bytes
 from pathlib import Path
 from xml.etree import ElementTree
@@ -33,13 +30,14 @@ from environments import (
     new_environment,
     own_variables,
     run,
+    running_backend,
 )
 from hidden import without
 from packaging.requirements import Requirement
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
-PATIENCE = 60.0  # [s] for a node to end
+PATIENCE = 60.0  # [s] for a command to end
 EXECUTABLES = {'backend', 'scan_loops', 'replay', 'l1slam'}
 OF_ROS = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs',
           'rcl_interfaces', 'sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs')
@@ -130,44 +128,13 @@ def test_package_xml_and_setup_py_say_and_need_the_same(metadata, requirements):
     assert manifest.findtext('name') == metadata['Name'].replace('-', '_')
     assert manifest.findtext('version') == metadata['Version']
     assert manifest.findtext('description') == metadata['Summary']
-    assert metadata['Description-Content-Type'] == 'text/markdown'
-    assert metadata.get_payload(decode=True) == (ROOT / 'README.md').read_bytes()
-    assert manifest.findtext('license') == 'Apache-2.0'
-    assert 'Apache-2.0' in (metadata['License'], metadata['License-Expression'])
-    assert maintainer.text == metadata['Maintainer'] == 'l1slam_ros maintainers'
-    assert maintainer.get('email') == metadata['Maintainer-email']
-    assert manifest.findtext('export/build_type') == 'ament_python'
+    assert manifest.findtext('license') in (metadata['License'], metadata['License-Expression'])
+    assert (maintainer.text, maintainer.get('email')) == (
+        metadata['Maintainer'], metadata['Maintainer-email'])
     keys = {element.text for element in manifest.findall('exec_depend')}
     only_of_pip = {'rosbags', 'mcap'}  # see test_release.py
     needed = {Requirement(text).name.lower() for text in requirements} - only_of_pip
     assert {'python3-yaml' if name == 'pyyaml' else f'python3-{name}' for name in needed} <= keys
-
-
-def test_the_changelog_has_the_form_that_bloom_and_catkin_read(metadata):
-    """As `catkin_generate_changelog` writes it; what is not released yet is `Forthcoming`."""
-    lines = (ROOT / 'CHANGELOG.rst').read_text().splitlines()
-    title = 'Changelog for package l1slam_ros'
-    assert lines[:4] == ['^' * len(lines[0]), title, '^' * len(lines[0]), '']
-    assert len(lines[0]) >= len(title)
-    sections = [(lines[k - 1], line) for k, line in enumerate(lines)
-                if line and not line.strip('-')]
-    assert sections and all(len(line) == len(name) for name, line in sections)
-    for name, _ in sections[sections[0][0] == 'Forthcoming':]:
-        assert re.fullmatch(r'\d+\.\d+\.\d+ \(\d{4}-\d\d-\d\d\)', name), name
-    if sections[0][0] != 'Forthcoming':
-        assert sections[0][0].split()[0] == metadata['Version']
-
-
-def test_the_sdist_has_what_builds_the_package_and_nothing_else(sdist, source):
-    with tarfile.open(sdist) as archive:
-        names = {name.partition('/')[2] for name in archive.getnames()}
-    wanted = {'setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE', 'README.md',
-              'resource/l1slam_ros'}
-    for folder in ('config', 'launch', 'resource/run', 'l1slam_ros'):
-        wanted |= {str(path.relative_to(source)) for path in (source / folder).rglob('*')
-                   if path.is_file()}
-    assert wanted <= names, wanted - names
-    assert not {name.split('/')[0] for name in names} & {'bags', 'benchmarks', 'demo'}
 
 
 def test_the_wheel_has_every_module_no_test_and_what_ros_looks_for(wheel):
@@ -178,7 +145,6 @@ def test_the_wheel_has_every_module_no_test_and_what_ros_looks_for(wheel):
     assert 'l1slam_ros/cli/report/page.html' in names
     (licence,) = [name for name in names if name.endswith('/LICENSE')]
     assert wheel.read(licence) == (ROOT / 'LICENSE').read_bytes()
-    assert b'Version 2.0, January 2004' in wheel.read(licence)
     data = f'{stem(wheel)}.data/data/'
     shared = {f'{data}share/l1slam_ros/{folder}/{path.name}' for folder in ('config', 'launch')
               for path in (ROOT / folder).iterdir() if path.is_file()}
@@ -190,41 +156,12 @@ def test_the_wheel_has_every_module_no_test_and_what_ros_looks_for(wheel):
     assert all(info.external_attr >> 16 & stat.S_IXUSR for info in starters.values())
 
 
-@pytest.mark.parametrize('name', sorted(EXECUTABLES))
-def test_a_starter_runs_the_executable_of_its_name(name, tmp_path):
-    folder = tmp_path / 'a prefix' / 'lib' / 'l1slam_ros'
-    folder.mkdir(parents=True)
-    (tmp_path / 'a prefix' / 'bin').mkdir()
-    shutil.copy(ROOT / 'resource' / 'run' / name, folder / name)
-    target = tmp_path / 'a prefix' / 'bin' / name
-    target.write_text('#!/bin/sh\necho "$0" "$#" "$2"\nexit 3\n')
-    target.chmod(0o755)
-    ran = subprocess.run([folder / name, 'one', 'two words'], capture_output=True, text=True)
-    assert ran.stdout.endswith(f'bin/{name} 2 two words\n')
-    assert ran.returncode == 3
-
-
 @pytest.mark.parametrize('name', ['backend', 'scan_loops', 'replay'])
 def test_what_needs_ros_says_so_in_one_line(name, tmp_path):
     ran = subprocess.run([Path(sysconfig.get_path('scripts')) / name], capture_output=True,
                          env=without(tmp_path, *OF_ROS), text=True, timeout=PATIENCE)
     assert ran.returncode == 1 and ran.stderr.count('\n') == 1, ran.stderr
     assert ran.stderr.startswith(f'{name}: ') and '; expected ROS 2' in ran.stderr
-
-
-@contextmanager
-def running_backend(*command, cwd, env):
-    """Start a node that must become ready; end it by SIGTERM, upon which it must exit with 0."""
-    process = subprocess.Popen([*command], cwd=cwd, env=env, stderr=subprocess.PIPE, text=True)
-    try:
-        line = process.stderr.readline()
-        assert 'ready' in line, line
-        yield
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENCE) == 0
-    finally:
-        process.kill()
-        process.communicate()
 
 
 def test_the_installed_wheel_runs(wheel, requirements, tmp_path):
@@ -321,15 +258,16 @@ def sourced(workspace, *command):
     return ['bash', '-c', '. "$0/install/setup.bash" && exec "$@"', workspace, *command]
 
 
-def test_a_sourced_workspace_runs_the_command(workspace, tmp_path):
-    lib = workspace / 'install' / 'l1slam_ros' / 'lib' / 'l1slam_ros'
+def test_a_sourced_workspace_runs_the_command_and_the_node(workspace, tmp_path):
+    lent = lent_variables(HOME=str(tmp_path))
+    prefix = workspace / 'install' / 'l1slam_ros'
+    lib, share = prefix / 'lib' / 'l1slam_ros', prefix / 'share' / 'l1slam_ros'
     assert {path.name for path in lib.iterdir()} == EXECUTABLES
     out = run(*sourced(workspace, lib / 'l1slam', 'info', ROOT / 'bags' / 'demo'), cwd=tmp_path,
-              env=lent_variables())
+              env=lent)
     assert 'poses       ' in out
-
-
-def test_a_sourced_workspace_is_found_by_ros_and_runs_the_node(workspace, tmp_path):
+    for path in ('package.xml', 'config/backend.yaml', 'launch/backend.launch.py'):
+        assert (share / path).read_bytes() == (ROOT / path).read_bytes()
     pytest.importorskip('rclpy')
     code = """
 import ament_index_python as index, l1slam_ros
@@ -337,15 +275,9 @@ print(index.get_package_prefix('l1slam_ros'))
 print(index.get_package_share_directory('l1slam_ros'))
 print(l1slam_ros.__file__)
 """
-    lent = lent_variables(HOME=str(tmp_path))
-    prefix, share, module = map(Path, run(
-        *sourced(workspace, environment(*COLCON).python, '-c', code), cwd=tmp_path,
-        env=lent).splitlines())
-    assert prefix == workspace / 'install' / 'l1slam_ros'
-    for path in ('package.xml', 'config/backend.yaml', 'launch/backend.launch.py'):
-        assert (share / path).read_bytes() == (ROOT / path).read_bytes()
-    assert module.is_relative_to(workspace)
-    lib = prefix / 'lib' / 'l1slam_ros'
+    found = run(*sourced(workspace, environment(*COLCON).python, '-c', code), cwd=tmp_path,
+                env=lent).splitlines()
+    assert found[:2] == [str(prefix), str(share)] and Path(found[2]).is_relative_to(workspace)
     command = sourced(workspace, lib / 'backend', '--ros-args', '--params-file',
                       share / 'config' / 'backend.yaml')
     with running_backend(*command, cwd=tmp_path, env=lent):

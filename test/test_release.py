@@ -13,13 +13,11 @@ import re
 import shutil
 import subprocess
 import sysconfig
-import time
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 from environments import own_variables
-from headers import HEADER, files_of_python
 from hidden import without
 from rosdep_keys import OF_JAZZY, OF_ROSDEP
 from worlds import made
@@ -49,15 +47,6 @@ def test_every_key_is_one_that_a_released_package_may_use():
             for name in re.findall(r'^\s*(?:from|import) (\w+)', path.read_text(), re.M)}
     assert used & OF_JAZZY.keys() <= set(keys)
     assert not {'python3-rosbags-pip', 'mcap-ros2-support'} & set(keys)
-
-
-def test_every_file_begins_with_copyright_and_licence():
-    """`python test/headers.py` puts them there, as ament_copyright looks for them."""
-    assert not [path for path in files_of_python() if not path.read_text().startswith(HEADER)]
-    assert re.match(r'# Copyright \d{4} l1slam_ros maintainers\n', HEADER)
-    licence = ' '.join((ROOT / 'LICENSE').read_text().split())
-    notice = licence[licence.rindex('Licensed under the Apache License'):]
-    assert notice in ' '.join(HEADER.replace('#', ' ').split())
 
 
 # The linters of ROS, and what they are run with. A docstring may begin with a sentence that is
@@ -112,31 +101,6 @@ def test_a_command_that_needs_what_is_not_there_names_it_in_one_line(
     assert {path.name for path in tmp_path.iterdir()} == before | {f'without_{hidden}'}
 
 
-def test_the_node_makes_a_map_where_nothing_optional_is(ros, start, tmp_path):
-    """On real DDS: odometry and a loop in, a Path out."""
-    from node_bench import LATCHED, Odometry, PoseWithCovarianceStamped, loop, odometry
-    from node_bench import Path as PathMessage
-
-    node, paths = ros.create_node('peer'), []
-    node.create_subscription(PathMessage, 'path', paths.append, LATCHED)
-    steps, loops = (node.create_publisher(kind, topic, 1000) for kind, topic in (
-        (Odometry, 'odom'), (PoseWithCovarianceStamped, 'loop_closures')))
-    process = start(**without(tmp_path, *OPTIONAL))
-    assert 'ready' in process.stderr.readline()
-
-    def until(condition, topic, *messages):
-        """Send messages again and again: at first, nobody may hear them."""
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline and process.poll() is None
-            for message in messages:
-                topic.publish(message)
-            ros.spin_once(node, timeout_sec=0.2)
-
-    # Ten metres out, and nine of them back.
-    way = [odometry((1000 + k) * 10**9, float(min(k, 20 - k))) for k in range(20)]
-    until(lambda: paths, steps, way[0])
-    until(lambda: len(paths[-1].poses) == 20, steps, *way[1:])
-    until(lambda: abs(paths[-1].poses[-1].pose.position.x - 0.95) < 0.03, loops,
-          loop(1019 * 10**9, 0.95, 'base_link@1000.000000000', 1e-4))
-    node.destroy_node()
+def test_the_node_starts_where_nothing_optional_is(start, tmp_path):
+    pytest.importorskip('rclpy')
+    assert 'ready' in start(**without(tmp_path, *OPTIONAL)).stderr.readline()

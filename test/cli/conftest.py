@@ -80,3 +80,20 @@ def soon(monkeypatch):
     """Let all be done soon: on a machine that is busy a log would have lines on what is not."""
     clock = time.monotonic
     monkeypatch.setattr(time, 'monotonic', lambda: clock() / 100)
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Return what sets the files, path -> text, that say which memory is free."""
+    read_text = Path.read_text
+
+    def tell(files):
+        def told(path, *more, **options):
+            if not str(path).startswith(('/proc/', '/sys/fs/cgroup/')):
+                return read_text(path, *more, **options)
+            if str(path) not in files:
+                raise FileNotFoundError
+            return files[str(path)]
+
+        monkeypatch.setattr(Path, 'read_text', told)
+    return tell

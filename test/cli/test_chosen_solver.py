@@ -8,8 +8,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which solver a graph gets: by what a factorisation costs, by name, and where one fails."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from command import run, solve_json
@@ -36,12 +34,10 @@ def test_sparse_graphs_get_the_interior_point_and_dense_ones_algorithm_4(capsys,
 
 
 @pytest.mark.parametrize('solver', ['auto', 'primal-dual', 'interior-point'])
-def test_a_graph_that_fills_in_gets_algorithm_4_or_is_refused(capsys, world, monkeypatch, solver):
+def test_a_graph_that_fills_in_gets_algorithm_4_or_is_refused(capsys, world, machine, solver):
     """With memory for a few blocks only: nothing is factored, and it is solved all the same."""
-    best, read_text = solve_json(capsys, world, '--no-robust')['final_cost'], Path.read_text
-    monkeypatch.setattr(Path, 'read_text', lambda path, *more, **options: (
-        'MemAvailable: 500 kB' if str(path) == '/proc/meminfo' else read_text(
-            path, *more, **options)))
+    best = solve_json(capsys, world, '--no-robust')['final_cost']
+    machine({'/proc/meminfo': 'MemAvailable: 500 kB'})
     if solver == 'interior-point':
         err = run(capsys, 'solve', world, '--no-robust', '--solver', solver, code=2)[1]
         assert err.count('\n') == 1 and (

@@ -12,40 +12,19 @@ import re
 import shlex
 
 import pytest
-from command import help_of, run, texts_of
+from command import help_of, run
 from worlds import graph_file
 
 VERTICES = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 1 1 0 0', 'VERTEX_SE2 2 2 0 0']
 EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
          'EDGE_SE2 0 2 2.1 0 0 1 0 0 1 0 1']
-AFTER_GAP = 'EDGE_SE2 2 3 1 0 0 1 0 0 1 0 1'
 
 
 def test_info_of_a_good_graph_and_of_its_bag(capsys, world, tmp_path):
-    out, err = run(capsys, 'info', world)
-    assert out.endswith('\nnothing looks wrong\n') and err == ''
     run(capsys, 'convert', world, tmp_path / 'bag')
-    out, _ = run(capsys, 'info', tmp_path / 'bag')
-    for row in ('duration    14.9 s from 1000.000000000',
-                'note        covariance increment, keyframes every',
-                'topic       /loop_closures: 101 of geometry_msgs/msg/PoseWithCovarianceStamped',
-                'topic       /odom: 150 of nav_msgs/msg/Odometry', 'poses       150 in SE2',
-                'time        14.9 s', 'nothing looks wrong'):
-        assert f'\n{row}' in f'\n{out}', out
-
-
-def test_info_says_what_was_skipped(capsys, tmp_path):
-    out, err = run(capsys, 'info', graph_file(tmp_path, [*VERTICES, *EDGES, 'VERTEX_XY 9 1 2']))
-    assert "- 1 line not used: 1 'VERTEX_XY' (landmarks" in out and err == ''
-
-
-def test_plot_draws_several_maps_with_false_loops_where_they_are_known(capsys, world, tmp_path):
-    run(capsys, 'corrupt', world, tmp_path / 'bad.g2o', '--false-loops', 12)
-    run(capsys, 'plot', world, world, tmp_path / 'bad.g2o', '--output', tmp_path / 'maps.svg')
-    said = texts_of(tmp_path / 'maps.svg')
-    assert said.count('world.g2o') == said.count('truth') == 2 and said.count('odometry') == 3
-    assert said.count('false loops') == 1 and said.count('bad.g2o') == 1
-    assert '150 poses, 101 loops' in said and '150 poses, 113 loops (12 false)' in said
+    for path in world, tmp_path / 'bag':
+        out, err = run(capsys, 'info', path)
+        assert out.endswith('\nnothing looks wrong\n') and err == ''
 
 
 @pytest.mark.parametrize('command, output', [('plot', '--output'), ('solve', '--plot')])
@@ -62,7 +41,6 @@ def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words, c
 
 @pytest.mark.parametrize('arguments, words', [
     (['solve', 'missing.g2o'], 'no such file'),
-    (['solve', 'graph.txt'], 'unknown kind'),
     (['solve', 'graph.g2o', '--start', 'file'], 'no poses'),
     (['solve', 'graph.g2o', '--inner', '0'], 'iterations'),
     (['solve', 'nan.g2o', '--output', 'out.g2o'], "nan.g2o:2: EDGE_SE2: 'nan' is not a finite"),
@@ -70,29 +48,20 @@ def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words, c
     (['solve', 'graph.g2o', '--output', 'out.doc'], 'suffix'),
     (['solve', 'graph.g2o', '--output', 'missing/out.g2o'], 'missing is no folder'),
     (['solve', 'graph.g2o', '--output', 'taken.g2o', '--plot', 'a.png'], 'it is a directory'),
-    (['solve', 'graph.g2o', '--plot', 'missing/out.png'], 'missing is no folder'),
     (['solve', 'gap.g2o', '--start', 'odometry'], 'consecutive vertices 1 and 2'),
-    (['solve', 'graph.g2o', '--output', 'other'], 'other: was not written by l1slam'),
-    (['simulate', 'other', '--poses', '10', '--edges', '12'],
-     'other: was not written by l1slam'),
-    (['convert', 'graph.g2o', 'out.doc'], 'suffix'),
     (['corrupt', 'graph.g2o', 'out.tum', '--false-loops', '1'], 'trajectory'),
     (['corrupt', 'graph.g2o', 'out.g2o', '--false-loops', '-1'], '--false-loops is -1'),
-    (['corrupt', 'graph.g2o', 'out.g2o', '--false-loops', '1000000000'], '3 pairs among 3'),
-    (['corrupt', 'missing.g2o', 'out.g2o', '--false-loops', '1'], 'no such file'),
     (['plot', 'graph.g2o', '--output', 'map.doc'], '.png'),
     (['plot', 'graph.g2o', 'missing.g2o', '--output', 'map.png'], 'missing.g2o'),
-    (['info', 'missing.g2o'], 'no such file'),
-    (['simulate', 'out.tum', '--poses', '10', '--edges', '12'], 'trajectory'),
-    (['solve', 'graph.g2o', '--plot', 'out.doc'], '.png'),
-    (['solve', 'graph.g2o', '--reference', 'missing.txt'], 'missing.txt'),
     (['solve', 'graph.g2o', '--params-file', 'graph.txt'], 'parameters'),
     (['solve', 'graph.g2o', '--params-file', 'other'], 'other: cannot be read: Is a directory'),
     (['solve', 'graph.g2o', '--plot', 'taken.png'], 'taken.png: cannot be written: it is a di'),
     (['solve', 'missing.g2o', '--output', '/proc/out.g2o'], '/proc/out.g2o: cannot be written'),
-    (['solve', 'missing.g2o', '--plot', '/proc/out.png'], '/proc/out.png: cannot be written'),
     (['simulate', '/proc/a.g2o', '--poses', '1', '--edges', '5'], '/proc/a.g2o: cannot be wri'),
-    (['simulate', 'out.g2o', '--poses', '10', '--edges', '5'], '9 to 45'),
+    (['simulate', 'out.g2o', '--poses', '10', '--edges', '8'],
+     '8 edges between 10 poses, expected 9 to 45'),
+    (['simulate', 'out.g2o', '--poses', '10', '--edges', '46'], 'expected 9 to 45'),
+    (['simulate', 'out.g2o', '--poses', '1', '--edges', '0'], 'expected 2 or more'),
     (['simulate', 'out.g2o', '--poses', '10', '--edges', '12', '--scans'], 'holds no scans'),
     (['simulate', 'out', '--poses', '10', '--edges', '12', '--scans', '--world', 'torus'],
      '--scans in the world torus'),
@@ -105,7 +74,7 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     (tmp_path / 'graph.txt').write_text('{}')
     for name in ('other', 'taken.g2o', 'taken.png'):
         (tmp_path / name).mkdir()
-    (tmp_path / 'gap.g2o').write_text('\n'.join([EDGES[0], AFTER_GAP, EDGES[2]]))
+    (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 2 3 1 '))
     (tmp_path / 'nan.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 1 2 nan '))
     (tmp_path / 'lonely.g2o').write_text('\n'.join([*VERTICES, 'VERTEX_SE2 9 0 0 0', *EDGES]))
     there = sorted(tmp_path.iterdir())

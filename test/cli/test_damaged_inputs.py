@@ -40,12 +40,6 @@ def test_a_packed_log_with_a_damaged_block_is_used_up_to_there(capsys, tmp_path)
     assert 'log.gz: cannot be read: ' in refused(capsys, 'info', path)
 
 
-def test_a_packed_log_without_end_is_refused(capsys, tmp_path):
-    path = tmp_path / 'log.gz'
-    path.write_bytes(gzip.compress(b'PARAM ' * 2**20 + b'\n', 9) + gzip.compress(log(3)))
-    assert 'bytes that unpack to more than a graph' in refused(capsys, 'info', path)
-
-
 @pytest.mark.parametrize('stamp', ['1e300', '1e11', '9223372037', 'nan'])
 def test_a_scan_of_a_stamp_that_no_clock_has_is_left_out(capsys, tmp_path, stamp):
     path = tmp_path / 'log.clf'
@@ -54,15 +48,7 @@ def test_a_scan_of_a_stamp_that_no_clock_has_is_left_out(capsys, tmp_path, stamp
     assert 'line 41: expected FLASER' in err and err.count('\n') == 1
 
 
-@pytest.mark.parametrize('norm', ['l2', 'huber', 'group-l1'])
-def test_a_drive_without_a_loop_has_a_norm_for_loops(capsys, tmp_path, norm):
-    path = tmp_path / 'drive.g2o'
-    path.write_text(''.join(f'EDGE_SE2 {k} {k + 1} 1 0 .1 9 0 0 9 0 9\n' for k in range(9)))
-    report = solve_json(capsys, path, '--loop-norm', norm)
-    assert report['status'] == 'converged' and report['final_cost'] < 1e-6
-
-
-@pytest.mark.parametrize('information', ['1e-20', '1e-30', '1e30'])
+@pytest.mark.parametrize('information', ['1e-30', '1e30'])
 def test_any_information_that_is_read_can_be_given(capsys, tmp_path, information):
     path = tmp_path / 'bare.g2o'
     ends = [(k, k + 1) for k in range(39)] + [(k, k + 20) for k in range(0, 19, 3)]

@@ -20,12 +20,6 @@ from worlds import edge, graph_file, pairs_of, torn, whitened
 
 import l1slam_ros as l1
 
-VERTICES = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 1 1 0 0', 'VERTEX_SE2 2 2 0 0']
-EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
-         'EDGE_SE2 0 2 2.1 0 0 1 0 0 1 0 1']
-AFTER_GAP = 'EDGE_SE2 2 3 1 0 0 1 0 0 1 0 1'
-
-
 DOUBT = re.compile(r'doubtful: (\d+) refused loops agree with each other on another map, '
                    r'between (\d+) and (\d+)( \([0-9.]+ s to [0-9.]+ s\))?\. Vouch '
                    'for a true loop, strike out a false one, or state the right noise')
@@ -113,7 +107,9 @@ GAP = 'no edge between the consecutive vertices 1 and 2, so no chain of odometry
 
 @pytest.mark.parametrize('start', ['seed', 'file'])
 def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys, tmp_path, start):
-    path = graph_file(tmp_path, [*VERTICES, 'VERTEX_SE2 3 3 0 0', EDGES[0], AFTER_GAP, EDGES[2]])
+    vertices = [f'VERTEX_SE2 {k} {k} 0 0' for k in range(4)]
+    edges = [f'EDGE_SE2 {ends} 0 0 1 0 0 1 0 1' for ends in ('0 1 1', '2 3 1', '0 2 2.1')]
+    path = graph_file(tmp_path, vertices + edges)
     asked = ['solve', path, '--start', start, '--json', '--output', tmp_path / 'out.g2o']
     out, err = run(capsys, *asked, '--robust', code=4)
     report = json.loads(out)
@@ -127,12 +123,9 @@ def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys,
 
 
 def test_a_graph_too_dense_to_judge_is_solved_as_far_as_it_was_judged(
-        capsys, world, monkeypatch):
+        capsys, world, machine):
     """With little free memory: the odometry alone can be factored, all loops cannot."""
-    read_text = Path.read_text
-    monkeypatch.setattr(Path, 'read_text', lambda path, *more, **options: (
-        'MemAvailable: 400 kB' if str(path) == '/proc/meminfo' else read_text(
-            path, *more, **options)))
+    machine({'/proc/meminfo': 'MemAvailable: 400 kB'})
     for robust in ((), ('--robust',)):
         report = json.loads(run(capsys, 'solve', world, '--json', *robust, code=4)[0])
         assert report['status'] == 'doubtful' and report['suspect'] and not report['rejected']

@@ -74,16 +74,6 @@ def test_equivalent_vertices_without_an_edge_have_one_pose(capsys, tmp_path):
     assert ':11: vertex 7 is unknown' in one_line(capsys, 'info', graph)
 
 
-def test_lines_of_unknown_tags_are_counted_by_tag_in_one_line(capsys, tmp_path):
-    graph = written(tmp_path, [
-        *SQUARE[:2], 'LASER_ROBOT_DATA 1 -1.57 3.14 0.004 60 0.1 0 2 2.7 2.8', *SQUARE[2:],
-        'RGBD_DATA 0 1 image.png', 'RGBD_DATA 1 2 image.png', 'VERTEX_CAM 1 2 3', 'WIFI_DATA -71'])
-    sentence, = solve_json(capsys, graph, '--no-robust')['warnings'][:1]
-    assert sentence == (
-        "5 lines not used: 1 'LASER_ROBOT_DATA', 2 'RGBD_DATA' (sensor data and calibration are "
-        "no part of a pose graph); 1 'VERTEX_CAM', 1 'WIFI_DATA' (unknown tags)")
-
-
 @pytest.mark.parametrize('name', ['a.g2o.gz', 'a.toro.gz', 'a.g2o.bz2', 'a.jrl.gz'])
 def test_packed_graphs_are_read(capsys, tmp_path, name):
     plain = written(tmp_path, SQUARE)
@@ -127,24 +117,18 @@ def test_edges_without_information_are_said_and_may_get_one(capsys, tmp_path):
     assert found['final_cost'] == expected['final_cost']
     run(capsys, 'info', bare, *given)
     run(capsys, 'convert', bare, tmp_path / 'made.g2o', *given)
-    for path in tmp_path / 'made.g2o', full:
-        assert 'EDGE_SE2 0 1 1.0 0.0 1.5708 25.0 0.0' in (
-            path.read_text().replace(' 1 0 1.5708 25 0', ' 1.0 0.0 1.5708 25.0 0.0'))
-    (tmp_path / 'in').mkdir()
-    written(tmp_path / 'in', bare.read_text().splitlines())
-    run(capsys, 'batch', tmp_path / 'in', '--output', tmp_path / 'results', *given)
+    assert 'EDGE_SE2 0 1 1.0 0.0 1.5708 25.0 0.0' in (tmp_path / 'made.g2o').read_text()
     loops = written(tmp_path, ['EDGE_SE2 1:0 2:0 0 0 0'], 'between.txt')
-    assert 'between.txt:1: EDGE_SE2: 5 fields, the information is missing' in one_line(
-        capsys, 'merge', full, full, '--loops', loops, '--output', tmp_path / 'both.g2o')
-    run(capsys, 'merge', bare, full, '--loops', loops, '--output', tmp_path / 'both.g2o', *given,
-        '--no-robust')
+    merge = 'merge', bare, full, '--loops', loops, '--output', tmp_path / 'both.g2o'
+    assert 'the information is missing' in one_line(capsys, *merge)
+    run(capsys, *merge, *given, '--no-robust')
     with pytest.raises(l1.L1SlamError, match='the information is missing'):
         l1.read_graph(bare)
     graph, _ = l1.read_graph(bare, information=25)
     assert graph.between.sqrt_information[:, 0, 0].tolist() == [5, 5, 5, 5, 2]
 
 
-@pytest.mark.parametrize('value', ['0', '-1', 'nan', 'inf', 'much'])
+@pytest.mark.parametrize('value', ['0', '-1', 'nan', 'inf'])
 def test_an_information_that_is_none_is_refused(capsys, tmp_path, value):
     with pytest.raises(SystemExit) as ended:
         run(capsys, 'info', written(tmp_path, SQUARE), f'--information={value}')
@@ -152,7 +136,7 @@ def test_an_information_that_is_none_is_refused(capsys, tmp_path, value):
     said = capsys.readouterr()[1]
     assert f"argument --information: '{value}'; expected a number above 0" in said
     with pytest.raises(l1.L1SlamError, match='^information is '):
-        l1.read_graph(tmp_path / 'graph.g2o', information=-1 if value == 'much' else float(value))
+        l1.read_graph(tmp_path / 'graph.g2o', information=float(value))
 
 
 @pytest.mark.parametrize(('tag', 'other', 'whose'), [
@@ -169,25 +153,12 @@ def test_information_in_the_order_of_the_other_format_is_recognised(
         f'read in that of {whose}']
 
 
-def test_a_few_matrices_that_are_not_definite_do_not_turn_the_order(capsys, tmp_path):
-    graph = written(tmp_path, [f'EDGE2 {line} {"50 0 0 40 1 100" if k < 20 else "9 0 9 9 0 0"}'
-                               for k, line in enumerate(drive())])
-    sentence, = solve_json(capsys, graph, '--no-robust')['warnings']
-    assert sentence.startswith('20 of 41 information matrices not positive definite, the worst at')
-
-
-@pytest.mark.parametrize(('header', 'comma'), [
-    ('#id x y theta', False), ('"stamp","x","y","theta"', True)])
-def test_a_truth_with_a_header_row_and_gaps_of_nan_is_read(capsys, tmp_path, header, comma):
-    graph = written(tmp_path, SQUARE)
-    (tmp_path / 'graph.g2o.stamps.txt').write_text(''.join(f'{k} {k}.0\n' for k in range(5)))
-    rows = ['0 0 0 0', '1 1 0 1.57', '2 NaN nan nan', '3 0 1 4.71', '4 0 0 0']
-    if comma:
-        rows = [row.replace(' ', ', ') for row in rows]
-    report = solve_json(capsys, graph, '--no-robust', '--reference',
-                        written(tmp_path, [header, *rows], 't.txt'))
+def test_true_poses_of_nan_are_left_out_and_said(capsys, tmp_path):
+    rows = '#id x y theta', '0 0 0 0', '1 1 0 1.57', '2 NaN nan nan', '3 0 1 4.71', '4 0 0 0'
+    truth = written(tmp_path, rows, 'truth.txt')
+    report = solve_json(capsys, written(tmp_path, SQUARE), '--no-robust', '--reference', truth)
     assert '1 true pose of 5 left out: NaN' in report['warnings']
-    assert report['ate_poses'] == (5 if comma else 4) and report['ate'] < 0.3
+    assert report['ate_poses'] == 4 and report['ate'] < 0.3
 
 
 def test_without_a_common_id_both_ranges_are_said(capsys, tmp_path):
@@ -216,17 +187,6 @@ def test_a_device_or_a_fifo_as_an_input_is_refused(capsys, tmp_path, name):
     path.unlink()
     path.symlink_to('/dev/zero')
     assert one_line(capsys, 'info', path).endswith('it is not a regular file\n')
-
-
-@pytest.mark.parametrize('name', ['metadata.yaml', 'bag_0.mcap', 'bag_0.db3'])
-def test_a_fifo_in_a_bag_is_not_waited_for(capsys, tmp_path, name):
-    (tmp_path / 'bag').mkdir()
-    (tmp_path / 'bag' / 'metadata.yaml').write_text(
-        f'rosbag2_bagfile_information: {{version: 5, relative_file_paths: [{name}]}}')
-    (tmp_path / 'bag' / name).unlink(missing_ok=True)
-    os.mkfifo(tmp_path / 'bag' / name)
-    (tmp_path / 'bag' / 'bag_1.mcap').write_bytes(b'')
-    assert 'bag: damaged, or not a bag (' in one_line(capsys, 'info', tmp_path / 'bag')
 
 
 def test_yaml_whose_aliases_expand_without_end_is_refused(capsys, tmp_path):

@@ -9,7 +9,6 @@
 """What memory is free: of the machine, of control groups of both versions, of the process."""
 
 import re
-from pathlib import Path
 
 import pytest
 from command import solve_json
@@ -39,17 +38,8 @@ FIRST = 'memory.limit_in_bytes', 'memory.usage_in_bytes', 'total_inactive_file'
     (group('0::/not/seen/from/here', '/sys/fs/cgroup', *SECOND), 200),
     (MACHINE | {'/proc/self/limits': f'Max address space      {300 * KILO}  unlimited  bytes\n',
                 '/proc/self/status': 'Name:\tone\nVmSize:\t 50 kB\n'}, 250)])
-def test_a_solve_may_take_most_of_what_is_free(capsys, world, monkeypatch, files, free):
-    read_text = Path.read_text
-
-    def told(path, *more, **options):
-        if not str(path).startswith(('/proc/', '/sys/fs/cgroup/')):
-            return read_text(path, *more, **options)
-        if str(path) not in files:
-            raise FileNotFoundError
-        return files[str(path)]
-
-    monkeypatch.setattr(Path, 'read_text', told)
+def test_a_solve_may_take_most_of_what_is_free(capsys, world, machine, files, free):
+    machine(files)
     warning, = solve_json(capsys, world, '--outer', 1, code=4)['warnings']
     said = re.search(r'of memory or more, and (\S+) GB are free', warning)
     assert float(said[1]) == pytest.approx(0.9 * free * KILO / 1e9, rel=0.01)

@@ -15,7 +15,6 @@ from contextlib import redirect_stdout
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command import run, solve_json
 from tags import TagWorld
@@ -46,18 +45,9 @@ def test_sightings_of_tags_hold_laps_of_a_hall_and_false_ones_are_refused(
     assert left_out(found) == world.false_pairs
 
 
-def test_a_file_as_rtabmap_exports_it(capsys, tmp_path, shared):
-    truth, pose = [], np.zeros(3)
-    for k in range(301):  # laps of a square of 25 m a side
-        if k:
-            pose[:2] += np.cos(pose[2]), np.sin(pose[2])
-            pose[2] += np.pi / 2 * (k % 25 == 0)
-        truth.append(' '.join(map(str, [k, *pose.tolist()])))
-    (tmp_path / 'truth.txt').write_text('\n'.join(truth))
-    found = solve_json(capsys, shared / 'reports' / 'tags6.g2o', '--reference',
-                       tmp_path / 'truth.txt')
-    assert found['ate'] < 0.15 and found['ate_poses'] == 301
-    assert found['loops'] == 69 and not left_out(found)
+def test_a_file_as_rtabmap_exports_it(capsys, shared):
+    found = solve_json(capsys, shared / 'reports' / 'tags6.g2o')
+    assert found['status'] == 'converged' and found['loops'] == 69 and not left_out(found)
 
 
 IDS = {
@@ -110,14 +100,6 @@ def test_a_false_first_sighting_is_refused_as_any(tmp_path, capsys):
     found = solved(capsys, tmp_path, world)
     assert left_out(found) == world.false_pairs and len(world.false) == 6
     assert found['slips'] == []
-
-
-@pytest.mark.parametrize('norm', ['l2', 'huber'])
-@SPACE
-def test_each_norm(tmp_path, capsys, norm, space):
-    world = TagWorld(1, 300, 6, 0.0, space)
-    found = solved(capsys, tmp_path, world, '--norm', norm)
-    assert found['ate'] < 0.15 and not left_out(found)
 
 
 def test_info_counts_landmarks_and_finds_no_gap_at_them(tmp_path, capsys):

@@ -152,10 +152,7 @@ def test_a_graph_without_stamps_is_said_to_have_none(capsys, tmp_path):
     Path(f'{graph}.stamps.txt').unlink()
     truth.write_text('5, 0, 0, 0\n6, 1, 0, 0\n')
     error, = run(capsys, 'solve', graph, '--reference', truth, code=2)[1].splitlines()
-    assert re.search('shares 0 poses with the graph, expected 2 or more; it '
-                     r'has times from 5\.0+ to 6\.0+ s, the graph times from 1000\.0+ to '
-                     r'1008\.20+ s; the graph has no stamps, so its poses are 0.1 s apart from '
-                     '1000 s on', error)
+    assert 'the graph has no stamps, so its poses are 0.1 s apart from 1000 s on' in error
 
 
 def test_the_command_says_over_how_many_poses(capsys, tmp_path, monkeypatch):
@@ -173,14 +170,3 @@ def test_the_command_says_over_how_many_poses(capsys, tmp_path, monkeypatch):
     Path('half.txt').write_text('\n'.join(lines[::2]))
     said = run(capsys, 'solve', 'world', '--reference', 'half.txt')[0]
     assert ' m over 60 of 120 poses (RMSE after rigid alignment)' in said
-
-
-def test_bicocca_by_its_stamps(capsys, datasets, tmp_path):
-    """4.36 m by odometry alone, as its truth has it at 5 Hz with gaps."""
-    real, graph = datasets / 'real', tmp_path / 'bicocca.g2o'
-    graph.write_bytes((real / 'bicocca25b_0.150.g2o').read_bytes())
-    Path(f'{graph}.stamps.txt').write_bytes((real / 'bicocca25b.stamps.txt').read_bytes())
-    report = solve_json(capsys, graph, '--no-robust', '--start', 'odometry', '--outer', 0,
-                        '--reference', real / 'bicocca25b.truth.csv')
-    assert report['ate'] == pytest.approx(4.36, abs=0.02)
-    assert 7000 < report['ate_poses'] < report['poses'] == 8358

@@ -21,13 +21,14 @@ from rooms import (
     along,
     box,
     drive,
+    driven,
     glass,
     mirrored,
     random_rays,
     write_scan_bag,
     write_truth,
 )
-from worlds import between, compose
+from worlds import between
 
 from l1slam_ros.cli.main import main
 
@@ -63,9 +64,7 @@ def standing(true, scans, first, last):
     wheels = drive(true)[1]
     steps = between(wheels[:-1], wheels[1:])
     steps[first:last] = 0
-    for k, step in enumerate(steps):
-        wheels[k + 1] = compose(wheels[k], step)
-    return true, scans, wheels
+    return true, scans, driven(steps)
 
 
 def carried():

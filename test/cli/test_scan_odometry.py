@@ -69,12 +69,6 @@ def test_along_a_corridor_it_claims_no_more_than_the_wheels_and_it_is_no_place(t
     assert (abs(found.errors(way))[:, 0] < 3 * sigma[:, 0]).all() and not len(found.loops)
 
 
-def legs(seed):
-    """Return the two rooms with 40 legs 6 cm thick: one scan sees others than the next."""
-    low = np.random.default_rng(seed).uniform((0.5, 0.5), (13.5, 5.5), (40, 2))
-    return np.concatenate((ROOMS, *(box(x, y, x + 0.06, y + 0.06) for x, y in low)))
-
-
 def exactly(true, _):
     """Return the steps that the robot makes."""
     return between(true[:-1], true[1:])
@@ -94,23 +88,15 @@ def forwards(true, seed):
     return steps
 
 
-def backing_up():
-    """Return a way that goes 60 cm backwards, twice turned, and on."""
-    back = compose(THROUGH[9], np.array([(-0.6, 0, 0.4), (-0.6, 0, 0.9)]))
-    return np.concatenate((THROUGH[:10], back, THROUGH[10:]))
-
-
 ALONG_A_WALL = along(np.array([(1.5, 1.5), (10.5, 1.5)]), 0.75)
 
 
 @pytest.mark.parametrize('true, walls, steps, seed, most', [
     # Beyond the door little is known; what is seen there contradicts nothing.
     (THROUGH, ROOMS, exactly, 0, 0.1),
-    (THROUGH, ROOMS, a_quarter_off, 0, 0.1), (THROUGH, ROOMS, a_quarter_off, 2, 0.1),
+    (THROUGH, ROOMS, a_quarter_off, 0, 0.1),
     (np.concatenate((ALONG_A_WALL[:6], ALONG_A_WALL[4:2:-1], ALONG_A_WALL[3:])), WALLS, forwards,
-     0, 0.1),
-    (backing_up(), legs(2), forwards, 2, 0.15), (backing_up(), legs(3), forwards, 3, 0.15)],
-    ids=['a door', 'off', 'off otherwise', 'backwards', 'legs', 'other legs'])
+     0, 0.1)], ids=['a door', 'off', 'backwards'])
 def test_a_metre_between_scans_it_goes_where_it_goes_whatever_the_wheels_say(
         tmp_path, true, walls, steps, seed, most):
     scans, _ = drive(true, seed, walls, ahead, period=1.0)

@@ -16,15 +16,6 @@ from worlds import compose, false_of, lines_of, pairs_of, truth_of
 import l1slam_ros as l1
 
 
-def test_simulate_writes_truth_and_false_loops(capsys, tmp_path):
-    output = tmp_path / 'bag'
-    run(capsys, 'simulate', output, '--poses', 200, '--edges', 300, '--false-loops', 5)
-    pairs = np.loadtxt(f'{output}.false.txt', dtype=int)
-    assert pairs.shape == (5, 2) and (pairs[:, 1] > pairs[:, 0] + 1).all()
-    assert len(np.loadtxt(f'{output}.truth.txt')) == 200
-    assert 'loops       106' in run(capsys, 'info', output)[0]
-
-
 def corrupted(capsys, path, output, *options):
     """Corrupt; return the graph, its poses, which of its factors are false, and their pairs."""
     run(capsys, 'corrupt', path, output, *options)
@@ -84,13 +75,3 @@ def test_corrupting_to_a_bag_counts_as_the_bag_does(capsys, odd, tmp_path):
     assert pairs.shape == (7, 2) and pairs.max() < 150
     run(capsys, 'plot', tmp_path / 'bad', '--output', tmp_path / 'map.svg')
     assert '150 poses, 108 loops (7 false)' in texts_of(tmp_path / 'map.svg')
-
-
-def test_a_graph_that_cannot_be_written_leaves_no_file_of_false_loops(
-        capsys, world, tmp_path, soon):
-    # Its odometry has a gap, for which there is no place in a bag.
-    path = tmp_path / 'gap.g2o'
-    path.write_text(world.read_text().replace('EDGE_SE2 0 1 ', 'EDGE_SE2 0 2 ', 1))
-    there = sorted(tmp_path.iterdir())
-    err = run(capsys, 'corrupt', path, tmp_path / 'bad', '--false-loops', 3, code=2)[1]
-    assert sorted(tmp_path.iterdir()) == there and err.count('\n') == 1

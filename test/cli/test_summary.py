@@ -78,13 +78,6 @@ def test_ids_of_all_64_bits_are_not_consecutive(info):
         f'vertex ids are not consecutive: 1 jump ({least} to {most})']
 
 
-def test_a_ratio_that_is_none_is_not_named(info, tmp_path):
-    """Of as few loops as these nothing is known but that the odometry suffers from them."""
-    world = made(tmp_path / 'world.g2o', 600, 630)
-    said, = info(*other(world, loops=(1.0, 1.0, 1.0)))[1]
-    assert re.search(r' are [0-9.]+ \(odometry\) times what the information says; ', said)
-
-
 def test_vertices_without_an_edge(info):
     lonely = [f'VERTEX_SE2 {k} 0 0 0' for k in range(10, 20)]
     assert info(*lonely, *LINES, LOOP)[1] == [
@@ -128,15 +121,6 @@ def test_an_offset_that_loops_share_is_one_sentence(info, tmp_path, capsys):
         found = re.match(r'loops share an offset of (.*) m and (.*) degrees, more than', said)
         assert float(found[1]) == pytest.approx(0.5, abs=0.05)
         assert float(found[2]) == pytest.approx(2.9, abs=0.3)
-
-
-def test_the_repeated_edges_of_intel(capsys, datasets):
-    numbers, complaints = info_of(capsys, datasets / 'intel.g2o')
-    assert complaints[0].startswith('2 edges (60 to 863, 179 to 864): given before')
-    assert numbers == {
-        'poses': '943 in SE2, ids 0 to 942', 'odometry': '942, 492.9 m',
-        'loops': '895, 4 of them beside another edge', 'components': '1',
-        'l1 cost': '1513.17 at the stored poses'}
 
 
 def test_the_numbers_of_a_graph_with_everything(info, tmp_path):
