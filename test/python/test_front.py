@@ -10,7 +10,7 @@
 
 import numpy as np
 import pytest
-from drives import CREDULOUS, EVERY, STATES, drive, loops_by, play, played, simulated
+from backends import CREDULOUS, EVERY, STATES, drive, loops_by, play, played, simulated
 from heard import seconds
 from numpy.testing import assert_allclose
 from worlds import whitened
