@@ -101,17 +101,3 @@ def test_loops_of_many_short_drives_are_doubted():
     assert found.kept == 0 and found.said['parts'] == robots
     assert found.doubts == ['one place joins', 'parts']
     assert len(found.said['doubts'][0]['loops']) == len(beside)
-
-
-def test_two_robots_that_only_false_loops_join_stay_two_parts():
-    """No two of them agree, so that there is not even a run of them to look at."""
-    rng, count, n = np.random.default_rng(0), 30, 60
-    sure = 100 * np.eye(3)
-    chain = np.delete(chain_of(2 * n), n - 1, axis=0)
-    drive = drive_of(np.zeros((2 * n, 3))).told(chain, np.tile((1.0, 0, 0.02), (2 * n - 2, 1)),
-                                                sure)
-    pairs = np.stack((rng.integers(0, n, count), rng.integers(n, 2 * n, count)), axis=1)
-    lies = np.column_stack((rng.uniform(-20, 20, (count, 2)), rng.uniform(-3, 3, count)))
-    found = solved(drive.told(pairs, lies, sure, True), ids=ids_of(2, n))
-    assert found.kept == found.lost == 0 and found.said['parts'] == 2
-    assert found.doubts == ['a weak map', 'parts']
