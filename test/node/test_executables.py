@@ -69,12 +69,6 @@ def test_the_help_of_backend_lists_all_and_starts_nothing():
     assert '[rad/rad]' in text
 
 
-def test_half_of_the_help_is_enough_for_who_wants_no_more():
-    shown = subprocess.run(['sh', '-c', '"$0" -h | head -n 1', executable('backend')],
-                           capture_output=True, text=True, timeout=DEADLINE)
-    assert shown.stdout.startswith('usage: backend') and not shown.stderr
-
-
 def test_the_help_of_the_others_lists_what_they_take():
     helped = run(executable('replay'), '--help')
     assert helped.returncode == 0 and '--ros-args' in helped.stdout and '--rate' in helped.stdout

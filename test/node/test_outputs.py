@@ -70,14 +70,9 @@ def test_the_graph_is_drawn_for_who_looks_also_for_who_comes_late(bench, tmp_pat
     assert (loops.type, loops.scale.x) == (Marker.LINE_LIST, 0.05)
     assert (late.drawn['keyframes', 0].type, late.drawn['keyframes', 0].scale.x) == (
         Marker.POINTS, 0.12)
-    # From green over yellow, at half of the worst, to red.
-    for one in loops.colors:
-        sure = one.r, np.interp(one.r, (0, 0.902), (0.62, 0.624)), np.interp(
-            one.r, (0, 0.902), (0.451, 0))
-        unsure = one.r, np.interp(one.r, (0.835, 0.902), (0.216, 0.624)), np.interp(
-            one.r, (0.835, 0.902), (0.055, 0))
-        assert min(np.abs(np.subtract((one.r, one.g, one.b), ladder)).max()
-                   for ladder in (sure, unsure)) < 0.02 and one.a == 1.0
+    # From green, which has hardly any red, to yellow and red.
+    assert {one.a for one in loops.colors} == {1.0}
+    assert min(one.g for one in loops.colors if one.r < 0.8) > 0.6
     assert min(one.r for one in loops.colors) < 0.3 < max(one.r for one in loops.colors)
     assert {(one.r, one.a) for one in late.drawn['odometry', 0].colors} == {(0.5, 1.0)}
 
@@ -109,19 +104,6 @@ def test_a_person_strikes_a_loop_out_and_vouches_for_it_after_all(bench):
     assert [value.key for value in refused.values] == [
         'reference_stamp', 'stamp', 'state', 'sigmas']
     assert {one.level for one in told if one.message != 'rejected'} == {DiagnosticStatus.OK}
-
-
-def test_a_loop_that_nothing_of_the_odometry_reaches_waits_and_expires(bench):
-    b = bench(**{'loop.wait': 2.0})
-    b.drive(0, 3)
-    b.send('/loop_closures', loop(40 * 10**9))
-    b.until(lambda: b.states() == {'waiting': 1}, 'it waits')
-    b.drive(3, 12)
-    b.until(lambda: b.states() == {'expired': 1}, 'it has expired')
-    b.send('/loop_closures', loop(41 * 10**9))
-    b.until(lambda: b.states() == {'expired': 1, 'waiting': 1}, 'another waits')
-    (status,) = b.received['loop_status'][1].status
-    assert (status.level, status.values[3].value) == (DiagnosticStatus.WARN, '')
 
 
 def test_the_covariance_is_that_of_the_sum_of_all_motions(bench):
