@@ -47,21 +47,6 @@ def cost(graph, poses):
     return np.abs(whitened(graph, poses)).sum()
 
 
-def test_incremental_ends_at_the_cost_of_batch(graph, best):
-    """Within 2 parts in 10,000; on the way each update ends within 1%."""
-    with l1.Backend(EVERY) as backend:
-        for k in range(0, 150, 10):
-            play(backend, graph, k, k + 10)
-            improvement = backend.update(PLENTY)
-            assert improvement.cost <= improvement.cost_before
-            if k in (40, 90, 140):
-                now = backend.snapshot().graph
-                batch = l1.solve(now, robust=False)
-                assert cost(now, backend.poses) == pytest.approx(batch.cost, rel=1e-2)
-        settled(backend)
-        assert cost(graph, backend.poses) == pytest.approx(best, rel=2e-4)
-
-
 @pytest.mark.parametrize('options', [EVERY, CREDULOUS], ids=['robust', 'credulous'])
 def test_settled_the_map_is_the_optimum_and_all_loops_are_judged(graph, best, options):
     with l1.Backend(options) as backend:

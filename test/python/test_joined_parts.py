@@ -78,26 +78,3 @@ def test_a_long_run_between_two_parts_against_several_places_is_doubtful(run):
     found = solved(drive)
     assert np.flatnonzero(~found.accepted).tolist() == [*range(len(chain), len(chain) + run)]
     assert found.doubts == ['another map'] * (run > 0)
-
-
-def ids_of(robots, own):
-    """Return the ids of keyframes of robots a, b and so on, as GTSAM has them."""
-    return [(ord('a') + robot << 56) + k for robot in range(robots) for k in range(own)]
-
-
-def test_loops_of_many_short_drives_are_doubted():
-    """All drive one street beside each other, each keyframe sees that of the next robot."""
-    robots, own = 8, 6
-    drive = drive_of(np.array([(k, 0.5 * robot, 0.0) for robot in range(robots)
-                               for k in range(own)]))
-    k = np.arange(robots * own)
-    steps, beside = k[k % own < own - 1], k[:-own]
-    pairs = np.concatenate((np.stack((steps, steps + 1), 1), np.stack((beside, beside + own), 1)))
-    noise = 0.01 * np.random.default_rng(0).standard_normal((len(pairs), 3))
-    drive = drive.seen(pairs, noise, 1e4 * np.eye(3))
-    found = solved(drive.told([[3, 40]], [[20.0, 20.0, 2.0]], 1e4 * np.eye(3), True),
-                   ids=ids_of(robots, own))
-    # All that see each other are of one place, and only they join the robots.
-    assert found.kept == 0 and found.said['parts'] == robots
-    assert found.doubts == ['one place joins', 'parts']
-    assert len(found.said['doubts'][0]['loops']) == len(beside)
