@@ -9,6 +9,7 @@
 """A robot on square laps, the loops it sees one lap back, and what drivers do to its odometry."""
 
 import numpy as np
+from heard import UNKNOWN, covariance6, pose3
 from worlds import between, compose, position_error
 
 import l1slam_ros as l1
@@ -33,12 +34,6 @@ def at(time):
     return compose(np.array(corners)[side.astype(int) % 4], on)
 
 
-def pose3_of(pose):
-    """Return x y z qx qy qz qw of a pose (3,), (7,)."""
-    x, y, theta = pose
-    return np.array([x, y, 0, 0, 0, np.sin(theta / 2), np.cos(theta / 2)])
-
-
 class Laps:
     """
     What is heard of a drive, without a fault.
@@ -49,36 +44,31 @@ class Laps:
 
     """
 
-    def __init__(self, seed=0, laps=3.0, twist=False, rate=RATE, speed=1.0):
+    def __init__(self, seed=0, laps=3.0, twist=False):
         rng = np.random.default_rng(seed)
-        self.period = 1 / rate
-        self.speed = speed
-        self.lap = LAP / speed
-        self.times = np.arange(round(laps * self.lap * rate)) / rate
-        truth = at(self.times * speed)
+        self.times = np.arange(round(laps * LAP * RATE)) / RATE
+        truth = at(self.times)
         steps = between(truth[:-1], truth[1:])
         # Half of it is the same all the way: a wheel's radius, a gyro's scale.
-        error = 1 + rng.normal(0, 0.01, 3) + rng.normal(0, 0.01 * np.sqrt(rate), steps.shape)
+        error = 1 + rng.normal(0, 0.01, 3) + rng.normal(0, 0.01 * np.sqrt(RATE), steps.shape)
         odometry = [np.zeros(3)]
         for step in steps * error:
             odometry.append(compose(odometry[-1], step))
         self.odometry = np.array(odometry)
-        x, y, angle = (np.vstack((steps, steps[-1:])) * rate * twist).T
+        x, y, angle = (np.vstack((steps, steps[-1:])) * RATE * twist).T
         self.speeds = [*zip(np.hypot(x, y).tolist(), np.abs(angle).tolist(), strict=True)]
-        ends = np.arange(self.lap, self.times[-1], 0.5 / speed)
-        begins = ends - self.lap
-        measured = compose(between(at(begins * speed), at(ends * speed)),
+        ends = np.arange(LAP, self.times[-1], 0.5)
+        begins = ends - LAP
+        measured = compose(between(at(begins), at(ends)),
                            LOOP_SIGMA * rng.standard_normal((len(ends), 3)))
-        covariance = np.diag(np.insert(LOOP_SIGMA, 2, np.zeros(3))**2)
-        self.loops = [l1.LoopClosure(stamp(begin), stamp(end), pose3_of(Z), covariance)
+        covariance = covariance6(np.diag(LOOP_SIGMA**2))
+        self.loops = [l1.LoopClosure(stamp(begin), stamp(end), pose3(Z), covariance)
                       for begin, end, Z in zip(begins, ends, measured, strict=True)]
 
-    def sample(self, k, pose=None, covariance=None):
+    def sample(self, k, pose=None):
         """Return the message of number k; pose (3,) : what it says."""
-        pose3 = pose3_of(self.odometry[k] if pose is None else pose)
-        none = np.zeros((6, 6))
-        return l1.OdometrySample(stamp(self.times[k]), pose3,
-                                 none if covariance is None else covariance, none, '',
+        pose = self.odometry[k] if pose is None else pose
+        return l1.OdometrySample(stamp(self.times[k]), pose3(pose), UNKNOWN, UNKNOWN, '',
                                  self.speeds[k])
 
     def samples(self):
@@ -92,7 +82,7 @@ class Laps:
     def restarted(self, begin, silence, where):
         """Return the messages of odometry that begins again at `where` (3,) after a silence."""
         last = int(np.searchsorted(self.times, begin, side='right')) - 1
-        first = last + max(round(silence / self.period), 1)
+        first = last + max(round(silence * RATE), 1)
         start = self.odometry[last] if where is SAME else np.array(where, float)
         frame = compose(start, between(self.odometry[first], np.zeros(3)))
         return [self.sample(k) for k in range(last + 1)] + [
@@ -113,7 +103,7 @@ class Laps:
 
     def error(self, snapshot):
         """Return the RMSE of the positions of the keyframes [m]."""
-        truth = at((snapshot.stamps - stamp(0.0)) * 1e-9 * self.speed)
+        truth = at((snapshot.stamps - stamp(0.0)) * 1e-9)
         return position_error(snapshot.poses[:, :2], truth[:, :2])
 
 

@@ -94,9 +94,9 @@ class Drive:
         measured[rows, 2] -= drift * np.hypot(*measured[rows, :2].T)
         return replace(self, measured=measured)
 
-    def write(self, path, ids=None):
-        """Write the graph, its keyframes with these ids (n,) or 0 and so on; return its path."""
-        return write_g2o(path, self.pairs, self.measured, self.information, ids=ids)
+    def write(self, path):
+        """Write the graph; return its path."""
+        return write_g2o(path, self.pairs, self.measured, self.information)
 
 
 def drive_of(truth):
@@ -166,10 +166,10 @@ class Map:
         return np.count_nonzero(~self.accepted & ~self.drive.false)
 
 
-def solved(drive, norm='l2', ids=None, trusted=()):
+def solved(drive, norm='l2', trusted=()):
     """Solve a drive, of which a person vouches for some pairs; return its `Map`."""
     with tempfile.TemporaryDirectory() as name:
-        path, output = drive.write(Path(name) / 'a.g2o', ids), Path(name) / 'b.g2o'
+        path, output = drive.write(Path(name) / 'a.g2o'), Path(name) / 'b.g2o'
         Path(f'{path}.trusted.txt').write_text(''.join(f'{i} {j}\n' for i, j in trusted))
         said = StringIO()
         with redirect_stdout(said), redirect_stderr(StringIO()):

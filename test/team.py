@@ -36,14 +36,13 @@ class Team:
         self._factors, self._covariances = graph.between, covariances_of(graph)
         self.odometry = odometry_of(graph)
 
-    def _graph(self, firsts=()):
-        """Return the graph of all; firsts : keyframes at which a robot begins anew."""
+    def _graph(self):
+        """Return the graph of all."""
         factors, graph = self._measured.between, l1.FactorGraph(self.manifold)
-        for k, robot in enumerate(self.robot.tolist()):
-            graph.add_poses(1, robot, begins_part=k in firsts)
-        known = ~(factors.is_odometry & np.isin(factors.j, firsts))
-        graph.add_between(factors.i[known], factors.j[known], factors.measurement[known],
-                          information_of(self._measured)[known])
+        for robot in self.robot.tolist():
+            graph.add_poses(1, robot)
+        graph.add_between(factors.i, factors.j, factors.measurement,
+                          information_of(self._measured))
         return graph
 
     def number(self, k):
@@ -80,13 +79,9 @@ class Team:
                    for i, j, found in self.loops()]
         return [event[2:] for event in sorted(events, key=lambda event: event[:2])]
 
-    def believed(self, firsts=()):
-        """
-        Return what the batch solver believes: robots and stamps of loops.
-
-        firsts : keyframes at which robots begin anew, as far as it knows
-        """
-        graph = self._graph(firsts)
+    def believed(self):
+        """Return what the batch solver believes: robots and stamps of loops."""
+        graph = self._graph()
         rows = l1.solve(graph).inliers & ~graph.between.is_odometry
         return {(int(self.robot[i]), int(self.robot[j]), self.stamp(i), self.stamp(j))
                 for i, j in graph.between.pairs[rows]}
@@ -107,8 +102,7 @@ class Restarts(Team):
         far = np.linspace(0.3, 0.1, self.manifold.TANGENT_SIZE)
         far[:2] = 300.0, 200.0
         far = self.manifold.retract(self.manifold.identity(1), far[None])
-        self.firsts = [robot * self.share + at for robot in (1, 2)]
-        for first in self.firsts:
+        for first in (robot * self.share + at for robot in (1, 2)):
             part = self.odometry[first:first - at + self.share]
             part[:] = self.manifold.compose(np.broadcast_to(far, part.shape), part)
 

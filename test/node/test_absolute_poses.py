@@ -13,69 +13,65 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from fixes import seen
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_bench import EVERY_MESSAGE, call, header, odometry, poses_of, stamp_of
-from worlds import compose, made, truth_of
+from node_bench import call, header, poses_of, put
 
-import l1slam_ros as l1
+NS = 10**9
 
 
-def fix(stamp, position, frame='map', variance=0.01):
+def fix(stamp, variances, frame='map', position=(1.0, 0.0, 0.0), w=1.0):
     message = PoseWithCovarianceStamped(header=header(frame, stamp))
-    message.pose.pose.position.x, message.pose.pose.position.y = position
-    message.pose.covariance = np.diag([variance, variance, 0, 0, 0, 0.0]).ravel()
+    put(message.pose.pose, position, (0, 0, 0, w))
+    message.pose.covariance = np.diag(np.array(variances, float)).ravel()
     return message
 
 
-def test_a_world_seen_by_gps_is_saved_and_goes_on(bench, tmp_path):
-    rng = np.random.default_rng(5)
-    path = made(tmp_path / 'world.g2o', 200, 300, '--seed', 5)
-    graph, poses = l1.read_graph(path)
-    world = seen(graph, truth_of(path), 10, rng, 0.1, sigma=0.2)
-    l1.write_graph(tmp_path / 'bag', world.graph, poses)
-    b = bench(save_path=str(tmp_path / 'map.g2o'), **EVERY_MESSAGE)
-    b.play(tmp_path / 'bag')
-    keyframes = [stamp_of(pose.header) for pose in b.map_of(200).poses]
+def test_a_drive_seen_by_gps_is_in_the_world_and_goes_on(bench, tmp_path):
+    """A position every three metres, two of them far off."""
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    start, ahead, false = np.array([100.0, -40.0]), np.array([np.cos(2.0), np.sin(2.0)]), [7, 16]
+    b.drive(0, 31)
+    for k in range(1, 31, 3):
+        x, y = start + k * ahead + 50.0 * (k in false)
+        b.send('/absolute_poses', fix((k + 1) * NS, (0.04, 0.04, *4 * [0.0]), 'map', (x, y, 0.0)))
 
     def refused():
         ends = {end for (_, end), (state, _) in b.loops().items() if state != 'accepted'}
-        return sorted(map(keyframes.index, ends))
+        return sorted(end // NS - 1 for end in ends)
 
-    b.until(lambda: len(b.loops()) == 20 and refused() == world.false.tolist(),
-            'the false ones are refused, no others')
-    assert call(b, 'optimize').success
-    b.until(lambda: world.error(poses_of(b.path())) < 0.6, 'the Path is in the world')
-    assert refused() == world.false.tolist()
+    def is_there(last):
+        """Tell whether the path of so many keyframes is in the world."""
+        expected = start + np.arange(last)[:, None] * ahead
+        found = poses_of(b.path())[:, :2]
+        return len(found) == last and np.abs(found - expected).max() < 0.6
+
+    b.until(lambda: len(b.loops()) == 10 and refused() == false, 'the false ones are refused')
+    assert call(b, 'optimize').success and refused() == false
+    b.until(lambda: is_there(31), 'the Path is in the world')
     assert call(b, 'save').success and call(b, 'reset').success
     b.map_of(0)
     b.received['loop_status'].clear()
     assert call(b, 'load').success
-    _, before = l1.read_graph(tmp_path / 'map.g2o')
-    np.testing.assert_allclose(poses_of(b.map_of(200)), before, atol=1e-6)
-    b.until(lambda: len(b.loops()) == 20 and refused() == world.false.tolist(),
-            'they are judged anew')
-    # The robot drives ten metres on, straight ahead, and GPS sees it there.
-    last = before[-1]
-    for k in range(12):
-        b.send('/odom', odometry((2000 + k) * 10**9, 1.0 * k))
-    there = compose(last, np.array([11.0, 0.0, 0.0]))
-    b.send('/absolute_poses', fix(2011 * 10**9, there[:2].tolist()))
-    b.until(lambda: [state for (_, end), (state, _) in b.loops().items() if end == 2011 * 10**9]
-            == ['accepted'], 'the new one is believed')
-    assert len(b.loops()) == 21
-    b.until(lambda: stamp_of(b.path().poses[-1].header) == 2011 * 10**9 and np.hypot(
-        *(poses_of(b.path())[-1] - there)[:2]) < 1.0, 'the Path is there')
+    b.until(lambda: is_there(31), 'it is there again')
+    b.until(lambda: len(b.loops()) == 10 and refused() == false, 'they are judged anew')
+    b.drive(31, 41)
+    x, y = start + 40 * ahead
+    b.send('/absolute_poses', fix(41 * NS, (0.04, 0.04, *4 * [0.0]), 'map', (x, y, 0.0)))
+    b.until(lambda: len(b.loops()) == 11 and refused() == false, 'the new one is believed')
+    b.until(lambda: is_there(41), 'it goes on')
 
 
-def test_what_is_not_of_the_map_frame_or_says_nothing_is_counted(bench):
-    b = bench()
-    b.send('/odom', odometry(10**9, 0.0))
-    b.send('/odom', odometry(2 * 10**9, 1.0))
-    for message in (fix(10**9, (1.0, 2.0), 'odom'), fix(10**9, (1.0, 2.0), ''),
-                    fix(10**9, (1.0, 2.0), variance=0.0)):
+def test_without_a_heading_no_quaternion_is_needed_and_what_says_nothing_is_counted(bench):
+    b = bench(**{'robust.enabled': False})
+    b.drive(0, 4)
+    for k, unsaid in enumerate((0.0, -1.0, np.inf, 1.1e6)):
+        b.send('/absolute_poses', fix((k + 1) * NS, (1, 1, 1, *3 * [unsaid]), w=0.0,
+                                      position=(float(k), 0, 0)))
+    for message in (fix(NS, (1, 1, 1, 0, 0, 1), w=0.0), fix(NS, np.ones(6), 'a@1.000000000'),
+                    fix(NS, np.ones(6), ''), fix(NS, np.zeros(6)),
+                    fix(NS, np.ones(6), position=(np.nan, 0, 0)),
+                    fix(NS, np.ones(6), position=(1e10, 0, 0))):
         b.send('/absolute_poses', message)
-    b.send('/absolute_poses', fix(2 * 10**9, (30.0, 2.0)))
-    b.until(lambda: b.refused() == {'frame': 2, 'covariance': 1}, 'they are counted')
-    b.until(lambda: b.path().poses and b.path().poses[-1].pose.position.x == pytest.approx(30),
-            'the one that is left puts the map in its place')
+    expected = {'quaternion': 1, 'frame': 2, 'covariance': 1, 'not_finite': 1, 'range': 1}
+    b.until(lambda: b.refused() == expected, 'what cannot be used is refused')
+    b.until(lambda: b.states() == {'accepted': 4}, 'the others are used')

@@ -13,9 +13,9 @@ import pytest
 
 rclpy = pytest.importorskip('rclpy')
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped
 from messages import TYPES
-from node_bench import EVERY_MESSAGE, call, header, odometry, poses_of, put, stamp_of
+from node_bench import EVERY_MESSAGE, call, odometry, poses_of, put, stamp_of
 from rclpy.serialization import serialize_message
 from records import information_of, read
 
@@ -44,9 +44,8 @@ def test_odometry_says_what_ros_makes_of_it(bench, tmp_path, base):
         message.twist.twist.linear.x = 17.0
         data = serialize_message(message)
         b.send('/odom', [message, data, other_order(data)][k % 3])
-    b.until(lambda: len(b.path().poses) == 9, 'all are used')
+    found = poses_of(b.map_of(9))
     assert b.path().poses[-1].header.stamp.nanosec == 345 and not b.refused()
-    found = poses_of(b.path())
     np.testing.assert_allclose(found[:, :2], np.outer(np.arange(9), (1.5, -0.25)), atol=1e-9)
     np.testing.assert_allclose(found[:, 2], np.arange(9) / 4, atol=1e-9)
     b.rest()
@@ -73,7 +72,7 @@ def test_whatever_is_cut_off_or_nonsense_is_refused_and_nothing_else_happens(ben
     call(b, 'reset')
     b.send('/odom', odometry(3 * NS, 0.0))
     b.send('/odom', odometry(4 * NS, 1.0))
-    b.until(lambda: len(b.path().poses) == 2, 'it goes on')
+    b.map_of(2)
 
 
 # Every remainder modulo 8.
@@ -81,8 +80,8 @@ def test_whatever_is_cut_off_or_nonsense_is_refused_and_nothing_else_happens(ben
 def test_ros_reads_path_pose_and_transform_as_they_were_meant(bench, frame):
     b = bench(map_frame=frame, odom_frame='odom_frame'[:len(frame) + 2], **EVERY_MESSAGE)
     b.drive(0, 2)
-    b.until(lambda: len(b.path().poses) == 2 and len(b.received['pose']) == 2, 'a map')
-    b.until(lambda: b.received['map_to_odom'], 'a transform')
+    b.map_of(2)
+    b.until(lambda: len(b.received['pose']) == 2 and b.received['map_to_odom'], 'all is there')
     path, pose, transform = (b.received[name][-1] for name in ('path', 'pose', 'map_to_odom'))
     assert {one.header.frame_id for one in (path, pose, transform, *path.poses)} == {frame}
     assert [stamp_of(one.header) for one in path.poses] == [NS, 2 * NS]
@@ -91,25 +90,3 @@ def test_ros_reads_path_pose_and_transform_as_they_were_meant(bench, frame):
     assert isinstance(pose, PoseStamped) and pose.pose.position.x == pytest.approx(1)
     assert transform.child_frame_id == 'odom_frame'[:len(frame) + 2]
     assert transform.transform.rotation.w == pytest.approx(1)
-
-
-def fix(stamp, variances, frame='map', position=(1.0, 0.0, 0.0), w=1.0):
-    message = PoseWithCovarianceStamped(header=header(frame, stamp))
-    put(message.pose.pose, position, (0, 0, 0, w))
-    message.pose.covariance = np.diag(np.array(variances, float)).ravel()
-    return message
-
-
-def test_an_absolute_pose_without_a_heading_needs_no_quaternion(bench):
-    b = bench(**{'robust.enabled': False})
-    b.drive(0, 4)
-    for k, unsaid in enumerate((0.0, -1.0, np.inf, 1.1e6)):
-        b.send('/absolute_poses', fix((k + 1) * NS, (1, 1, 1, *3 * [unsaid]), w=0.0,
-                                      position=(float(k), 0, 0)))
-    for message in (fix(NS, (1, 1, 1, 0, 0, 1), w=0.0), fix(NS, np.ones(6), 'a@1.000000000'),
-                    fix(NS, np.ones(6), position=(np.nan, 0, 0)),
-                    fix(NS, np.ones(6), position=(1e10, 0, 0))):
-        b.send('/absolute_poses', message)
-    b.until(lambda: b.refused() == {'quaternion': 1, 'frame': 1, 'not_finite': 1, 'range': 1},
-            'what cannot be used is refused')
-    b.until(lambda: b.states() == {'accepted': 4}, 'the others are used')

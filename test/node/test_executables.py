@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 from test_demo import NOBODYS, ODD
-from test_introspection import ELSEWHERE, INPUTS, OUTPUTS, PARAMETERS, SERVICES
+from test_introspection import ELSEWHERE, INPUTS, OUTPUTS, SERVICES
 
 pytest.importorskip('rclpy')
 
@@ -46,7 +46,7 @@ def test_the_tests_work_in_an_odd_shell():
     ran = run(sys.executable, '-m', 'pytest', '-p', 'no:cacheprovider', tests, '-k',
               'two_publishers or is_not_odom_frame', **ODD, ROS_DOMAIN_ID='7')
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert '2 passed' in ran.stdout and f'{NOBODYS}, which cannot be loaded here' in ran.stdout
+    assert '2 passed' in ran.stdout
 
 
 def test_the_help_of_backend_lists_all_and_starts_nothing():
@@ -62,17 +62,11 @@ def test_the_help_of_backend_lists_all_and_starts_nothing():
     for name, kind in {**INPUTS, **OUTPUTS, **SERVICES}.items():
         assert of_type.pop(name) == kind.replace('/msg/', '/').replace('/srv/', '/')
     assert of_type.keys() == ELSEWHERE
-    for name, (default, unit, _) in PARAMETERS.items():
-        shown = str(default).lower() if isinstance(default, bool) else repr(default)
-        assert f'\n  {name}: {shown}\n' in text and (f'[{unit}]' in text or not unit)
-    assert "\n  robots: ['']\n" in text  # a list as it is written
-    assert max(map(len, text.splitlines())) <= 99
-
-
-def test_half_of_the_help_is_enough_for_who_wants_no_more():
-    shown = subprocess.run(['sh', '-c', '"$0" -h | head -n 1', executable('backend')],
-                           capture_output=True, text=True, timeout=DEADLINE)
-    assert shown.stdout.startswith('usage: backend') and not shown.stderr
+    # Words, numbers, truth and lists as they are written.
+    for shown in ("map_frame: 'map'", 'keyframe.translation: 0.5', 'dimension: 2',
+                  'publish_tf: true', "robots: ['']"):
+        assert f'\n  {shown}\n' in text
+    assert '[rad/rad]' in text
 
 
 def test_the_help_of_the_others_lists_what_they_take():

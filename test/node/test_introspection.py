@@ -6,9 +6,8 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What `ros2 node info`, `ros2 param describe` and `ros2 lifecycle` show: the node's interface."""
+"""What `ros2 node info` and `ros2 lifecycle` show: the node's interface."""
 
-import re
 from pathlib import Path
 
 import pytest
@@ -21,14 +20,11 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from node_bench import call, odometry, parameters_of
-from rcl_interfaces.srv import DescribeParameters, ListParameters
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy, qos_profile_sensor_data
-from rosbags.typesys import Stores, get_typestore
 
 import l1slam_ros as l1
 
-ROOT = Path(__file__).parents[2]
-CONFIG = ROOT / 'config'
+CONFIG = Path(__file__).parents[2] / 'config'
 INPUTS = {
     '/odom': 'nav_msgs/msg/Odometry',
     '/loop_closures': 'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -55,24 +51,8 @@ LATCHED = {'/path', '/graph', '/loop_status'}
 ELSEWHERE = {'/map_graph', '/pose_graph', '/tf', '/slam_toolbox/pose_graph',
              '/slam_toolbox/new_node_event', '/cslam/keyframe_odom',
              '/cslam/intra_robot_loop_closure', '/cslam/inter_robot_loop_closure'}
-# What the layouts show besides: of scan_loops, see its own tests.
-SCANS = {'/map': 'nav_msgs/msg/OccupancyGrid', '/scan': 'sensor_msgs/msg/LaserScan'}
 # The types of what every node has, a managed one too.
 OF_ROS = 'lifecycle_msgs/', 'rcl_interfaces/', 'type_description_interfaces/'
-# name -> default, unit; those that only the start can set are marked.
-PARAMETERS = {
-    'map_frame': ('map', '', True), 'odom_frame': ('odom', '', True), 'base_frame': ('', '', True),
-    'update.period': (0.2, 's', False), 'update.budget': (0.1, 's', False),
-    'keyframe.translation': (0.5, 'm', False), 'keyframe.rotation': (0.2, 'rad', False),
-    'keyframe.period': (0.0, 's', False), 'odometry.covariance_source': ('model', '', False),
-    'odometry.sigma_translation': (0.05, 'm/m', False),
-    'odometry.sigma_rotation': (0.05, 'rad/rad', False),
-    'loop.covariance_source': ('message', '', False), 'loop.wait': (10.0, 's', False),
-    'robust.enabled': (True, '', False), 'dimension': (2, '', True),
-    'publish_tf': (True, '', True), 'transform_period': (0.05, 's', False),
-    'transform_tolerance': (0.1, 's', False), 'save_path': ('', '', False),
-    'on_time_jump': ('new_segment', '', False), 'autostart': (True, '', True),
-}
 
 
 def test_topics_and_services_are_those_of_the_interface(bench):
@@ -100,42 +80,6 @@ def test_topics_and_services_are_those_of_the_interface(bench):
         assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
 
 
-@pytest.mark.parametrize('way, topics', [('in', INPUTS), ('out', OUTPUTS)])
-def test_the_page_names_each_topic_and_its_type(way, topics):
-    page = (ROOT / 'doc' / 'topics_and_parameters.md').read_text()
-    table = page.split(f'| {way} | type | meaning |')[1]
-    said, types = {}, ''
-    for row in table.split('\n\n')[0].splitlines()[2:]:
-        names, kinds, _ = row.strip('| ').split(' | ', 2)
-        types = types if kinds == 'the same' else kinds
-        said |= zip(re.findall(r'`/?([a-z_]+)`', names), 2 * types.split(', '), strict=False)
-    assert {f'/{name}': kind.replace('/', '/msg/') for name, kind in said.items()
-            if f'/{name}' not in ELSEWHERE} == topics
-
-
-def test_parameters_are_described_with_unit_and_range(bench):
-    b = bench()
-    listed = set(call(b, 'list_parameters', kind=ListParameters).result.names)
-    assert listed >= PARAMETERS.keys()
-    names = [name for name in sorted(listed)
-             if not name.startswith('qos_overrides.') and name not in (
-                 'use_sim_time', 'start_type_description_service')]
-    answer = call(b, 'describe_parameters', DescribeParameters.Request(names=names),
-                  DescribeParameters)
-    for name, value, described in zip(names, parameters_of(b, *names), answer.descriptors,
-                                      strict=True):
-        assert described.description, name
-        if isinstance(value, float):
-            assert len(described.floating_point_range) == 1, name
-        elif isinstance(value, int) and not isinstance(value, bool):
-            assert len(described.integer_range) == 1, name
-        if name in PARAMETERS:
-            default, unit, fixed = PARAMETERS[name]
-            assert (value, described.read_only) == (default, fixed), name
-            assert unit in described.description and (f'[{unit}]' in described.description
-                                                      or not unit), name
-
-
 def test_parameters_given_by_a_wrong_name_are_told_of(bench, capfd):
     """To rclpy they are none: `keyframe.translaton` would do nothing without a word."""
     bench(**{'keyframe.translaton': 2.0, 'solver.norm': 'l1', 'zzz': 1,
@@ -150,57 +94,28 @@ def test_parameters_given_by_a_wrong_name_are_told_of(bench, capfd):
         "there is no parameter 'zzz': it is not used"]
 
 
-def rviz():
-    return yaml.safe_load((CONFIG / 'l1slam.rviz').read_text())['Visualization Manager']
-
-
-def foxglove():
-    return yaml.safe_load((CONFIG / 'foxglove.json').read_text())['configById']  # JSON is YAML
-
-
-def test_rviz_displays_each_topic_as_what_it_is():
+def test_what_shows_the_map_shows_each_topic_as_what_it_is():
     """
-    With the durability that it has, or who starts RViz late sees nothing of what stands.
+    In RViz with the durability that it has, or who starts it late sees nothing of what stands.
 
-    Relative, so that RViz in the namespace of a robot shows that one.
+    In both a person can say where the robot is.
     """
-    shown = {'/' + display['Topic']['Value']: (
-        display['Class'].split('/')[1], display['Topic']['Durability Policy'] != 'Volatile')
-        for display in rviz()['Displays'] if 'Topic' in display}
-    scans = {'/map': ('Map', True), '/scan': ('LaserScan', False)}
-    outputs = {topic: (OUTPUTS[topic].split('/')[2].removesuffix('Stamped'), topic in LATCHED)
-               for topic in shown.keys() - scans.keys()}
-    assert shown == outputs | scans and len(shown) == 6
-    (scan,) = (one for one in rviz()['Displays'] if one.get('Name') == 'Scan')
-    assert scan['Topic']['Reliability Policy'] == 'Best Effort', 'as a laser publishes'
-
-
-def test_foxglove_shows_topics_that_there_are():
-    panels = foxglove()
+    rviz = yaml.safe_load((CONFIG / 'l1slam.rviz').read_text())['Visualization Manager']
+    topics = {'/' + display['Topic']['Value']: (display['Class'].split('/')[1], display['Topic'])
+              for display in rviz['Displays'] if 'Topic' in display}
+    assert topics.keys() == {'/map', '/scan', '/path', '/pose', '/pose_with_covariance', '/graph'}
+    assert topics['/scan'][1]['Reliability Policy'] == 'Best Effort', 'as a laser publishes'
+    for topic in topics.keys() & OUTPUTS.keys():
+        kind, qos = topics[topic]
+        assert kind == OUTPUTS[topic].split('/')[2].removesuffix('Stamped')
+        assert (qos['Durability Policy'] != 'Volatile') == (topic in LATCHED)
+    panels = yaml.safe_load((CONFIG / 'foxglove.json').read_text())['configById']  # JSON is YAML
     shown = panels['3D!map']['topics'].keys() | {
         panels['DiagnosticSummary!all']['topicToRender'], panels['RawMessages!loops']['topicPath']}
-    assert shown < OUTPUTS.keys() | SCANS.keys() and len(shown) == 8
-
-
-def test_a_person_can_say_in_both_where_the_robot_is():
-    """Foxglove names the topic of each kind of click by a key of its own."""
-    (tool,) = (tool for tool in rviz()['Tools'] if tool['Class'].endswith('/SetInitialPose'))
-    publish = foxglove()['3D!map']['publish']
-    assert publish['type'] == 'pose_estimate'
-    for topic in '/' + tool['Topic']['Value'], publish['poseEstimateTopic']:
+    assert shown < OUTPUTS.keys() | {'/map', '/scan'} and len(shown) == 8
+    (tool,) = (tool for tool in rviz['Tools'] if tool['Class'].endswith('/SetInitialPose'))
+    for topic in '/' + tool['Topic']['Value'], panels['3D!map']['publish']['poseEstimateTopic']:
         assert INPUTS[topic] == 'geometry_msgs/msg/PoseWithCovarianceStamped'
-
-
-def test_foxglove_plots_fields_that_there_are():
-    text = (CONFIG / 'foxglove.json').read_text()
-    types = get_typestore(Stores.ROS2_JAZZY)
-    paths = re.findall(r'"value": "(/[a-z_]+)\.([a-z_.]+)"', text)
-    for topic, path in paths:
-        kind = OUTPUTS[topic]
-        for name in path.split('.'):
-            kind = {field: entry[1] for field, entry in types.fielddefs[kind][1]}[name]
-        assert kind == ('float64', 0), path
-    assert len(paths) == 2
 
 
 def change(b, transition):

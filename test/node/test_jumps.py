@@ -6,13 +6,15 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What the node does and says where a clock or its own map jumps."""
+"""Where a clock, a driver or its own map jumps, and how far ahead transforms are stamped."""
 
 import pytest
 
 pytest.importorskip('rclpy')
 
-from node_bench import loop, poses_of
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
+from node_bench import loop, odometry, poses_of, stamp_of, warnings
 from rosgraph_msgs.msg import Clock
 
 import l1slam_ros as l1
@@ -67,3 +69,47 @@ def test_the_jump_of_the_transform_is_said(bench):
     b.until(lambda: 0.01 < float(b.status()[2].get('jump.translation', 0)) < 1.01, 'a jump')
     b.until(lambda: b.path().poses[-1].pose.position.x == pytest.approx(4.0, abs=0.01),
             'a metre in all')
+
+
+@pytest.mark.parametrize('restarts', [True, False])
+def test_another_publisher_makes_a_small_jump_a_restart(bench, capfd, restarts):
+    """Without it, the odometry may as well have been corrected."""
+    b = bench()
+    for k in range(60):
+        if k == 30 and restarts:
+            b.peer.destroy_publisher(b.publishers['/odom'])
+            b.publishers['/odom'] = b.peer.create_publisher(Odometry, '/odom', 1000)
+            b.until(lambda: b.publishers['/odom'].get_subscription_count()
+                    and b.peer.count_publishers('/odom') == 1, 'the node hears of it')
+        stamp = 10 * 10**9 + k * 50_000_000
+        b.send('/odom', odometry(stamp, 5 + 0.05 * k + 0.4 * (k >= 30)))
+    b.until(lambda: b.newest() == 12_950_000_000, 'all is used')
+    b.anew()
+    assert b.count('keyframes') - 1 - b.count('factors') == restarts
+    assert b.count('odometry.new_part') == restarts and not b.refused()
+    assert (b.count('odom.received'), b.count('odom.lost')) == (60, 0)
+    told = warnings(capfd)
+    if restarts:
+        b.until(lambda: told.extend(warnings(capfd)) or told, 'it is told of')
+        assert len(told) == 1 and 'a new part of the map begins' in told[0]
+        assert 'at stamp 11500000000 ns' in told[0]
+        level, sentence, _ = b.status()
+        assert level == DiagnosticStatus.WARN and 'last minute: 1 new_part' in sentence
+    else:
+        assert not told
+
+
+def test_transforms_reach_to_the_odometry_that_comes_next(bench):
+    """That of a bag played fast, or that comes seldom: by more than the tolerance."""
+    b = bench(transform_period=3600.0)
+    for k in range(5):
+        b.drive(k, k + 1)
+        b.until(lambda k=k: len(b.received['map_to_odom']) == k + 2, 'a transform with a message')
+    # tf2 looks up between two: at first, before it is known how seldom, one at the stamp itself.
+    assert [stamp_of(message.header) for message in b.received['map_to_odom']] == [
+        10**9, 13 * 10**8, 23 * 10**8, 45 * 10**8, 55 * 10**8, 65 * 10**8]
+    # The longest pause but one counts, and two seconds at most; a time that goes back begins anew.
+    for stamp, end in (8, 0), (14, 15.5), (17, 0), (27, 29), (2, 0), (3, 3.3):
+        b.send('/odom', odometry(stamp * 10**9, 5.0))
+        b.until(lambda end=end: not end or stamp_of(b.received['map_to_odom'][-1].header) == round(
+            end * 10**9), f'a transform up to {end} s')

@@ -6,10 +6,11 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""When the node saves its map, what it never overwrites, and whose map a file is."""
+"""When the node saves its map, what it never overwrites, whose a file is, and what goes on."""
 
 import os
 import re
+import signal
 import time
 
 import numpy as np
@@ -17,7 +18,18 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from node_bench import EVERY_MESSAGE, call, loop, odometry, poses_of, set_parameter
+from diagnostic_msgs.msg import DiagnosticStatus
+from node_bench import (
+    DEADLINE,
+    EVERY_MESSAGE,
+    Peer,
+    call,
+    loop,
+    odometry,
+    poses_of,
+    set_parameter,
+)
+from worlds import as_map, edge
 
 import l1slam_ros as l1
 
@@ -45,7 +57,7 @@ def drive(b, first, last):
     """Drive; wait for the path."""
     count = len(b.path().poses)
     b.drive(first, last)
-    b.until(lambda: len(b.path().poses) == count + last - first, 'all keyframes')
+    b.map_of(count + last - first)
 
 
 def save(b):
@@ -87,7 +99,7 @@ def test_what_stands_there_may_yet_be_loaded_and_what_was_loaded_is_saved_at_onc
     assert not set_parameter(another, 'autosave_period', 0.0)
     another.close()
     going_on = at(HOUR, load_on_start=True)
-    going_on.until(lambda: len(going_on.path().poses) == 9, 'the map')
+    going_on.map_of(9)
     drive(going_on, 9, 10)
     going_on.until(lambda: keyframes(path) == 10, 'it is saved')
     assert {p.name for p in path.parent.iterdir()} == {'map.g2o', 'map.g2o.1'}
@@ -114,7 +126,7 @@ def test_a_map_that_is_not_its_own_is_kept_for_ever(at, path, why):
         b = at()
     elif why == 'reset':
         call(b, 'reset')
-        b.until(lambda: not b.path().poses, 'a new map begins')
+        b.map_of(0)
     else:
         path.write_text(SPACE)
         former = path.read_bytes()
@@ -127,6 +139,12 @@ def test_a_map_that_is_not_its_own_is_kept_for_ever(at, path, why):
     assert f'{path} held another map: it is kept as {kept}' in said[0]
     assert not any('is kept' in one for one in said[1:])
     assert keyframes(path) == len(b.path().poses) == keyframes(path.with_name('map.g2o.1')) + 3
+
+
+def test_what_saves_by_itself_keeps_the_graph_of_a_user_too(at, path):
+    path.write_text(SPACE)
+    drive(at(0.2), 0, 3)
+    assert SPACE in [p.read_text() for p in path.parent.glob('map.2*.g2o')]
 
 
 def test_two_who_save_to_one_path_do_not_fill_the_disk(at, path):
@@ -220,10 +238,65 @@ def test_a_map_of_three_robots_is_loaded_by_their_names_in_any_order_by_fewer_an
         b.close()
     # A robot without a name goes on in it; its pose is that of its path.
     nameless = bench(save_path=str(path), load_on_start=True, autosave_period=0.0, **EVERY_MESSAGE)
-    nameless.until(lambda: len(nameless.path().poses) == 12, 'the path of all')
+    nameless.map_of(12)
     nameless.send('/odom', odometry(60 * 10**9, 7.0))
-    nameless.until(lambda: len(nameless.path().poses) == 13, 'it goes on')
+    nameless.map_of(13)
     nameless.until(lambda: nameless.received['pose'], 'where it is')
     row, = (k for k, one in enumerate(nameless.path().poses) if one.header.stamp.sec == 60)
     pose = nameless.received['pose'][-1].pose.position
     assert (pose.x, pose.y) == pytest.approx(poses_of(nameless.path())[row, :2], abs=1e-6)
+
+
+def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, path, capfd):
+    path = path.with_name('none') / 'map.g2o'
+    b = bench(save_path=str(path), autosave_period=0.2)
+    said = f'save_path is {str(path)!r}, but there is no folder {path.parent}'
+    assert said in capfd.readouterr().err
+    assert set_parameter(b, 'save_path', str(path)) == said
+    drive(b, 0, 3)
+    b.until(lambda: b.status()[0] == DiagnosticStatus.ERROR
+            and f'autosave failed: {path}: cannot be written: ' in b.status()[1], 'it says so')
+    path.parent.mkdir()
+    b.until(lambda: b.status()[0] != DiagnosticStatus.ERROR, 'it is over')
+    assert keyframes(path) == 3
+
+
+def test_a_large_map_is_published_whenever_it_has_grown(at, path):
+    """By a thread of its own, which rests in between."""
+    many = 10_002
+    path.write_text('\n'.join(edge(k, k + 1, (1.0, 0.0, 0.0), 100 * np.eye(3))
+                              for k in range(many - 1)) + '\n')
+    as_map(path)
+    b = at(load_on_start=True)
+    b.map_of(many)
+    for last in 3, 6:
+        for k in range(last - 3, last):
+            b.send('/odom', odometry((20_000 + k) * 10**9, 1.0 * k))
+        poses = poses_of(b.map_of(many + last))
+    np.testing.assert_allclose(poses[:many, 0], np.arange(many), atol=1e-3)
+    np.testing.assert_allclose(poses[many:, 0], many - 1 + np.arange(6), atol=1e-3)
+
+
+def test_a_killed_node_goes_on_where_it_was_and_a_signal_loses_nothing(ros, start, path):
+    def begin():
+        return start('--ros-args', '-p', f'save_path:={path}', '-p', 'autosave_period:=0.2', '-p',
+                     'load_on_start:=true'), Peer(ros)
+
+    process, first = begin()
+    first.until_heard()
+    first.drive(0, 10)
+    first.until(lambda: keyframes(path) == 10, 'all is saved')
+    process.kill()
+    process.wait(DEADLINE)
+    first.close()
+    process, second = begin()
+    second.map_of(10)
+    second.until_heard()
+    second.drive(10, 20)
+    np.testing.assert_allclose(poses_of(second.map_of(20))[:, 0], np.arange(20), atol=1e-6)
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=DEADLINE)
+    second.close()
+    assert process.returncode == 0 and '10 keyframes loaded from' in said, said
+    assert keyframes(path) == 20
+    assert {p.name for p in path.parent.iterdir()} == {'map.g2o', 'map.g2o.1'}

@@ -45,26 +45,12 @@ def test_a_recorded_world_becomes_its_optimal_map_and_all_topics_agree(bench, tm
     assert ahead[0] >= 10**8 and (np.diff(ahead) > 0).all()
 
 
-def test_default_thresholds_make_a_keyframe_every_half_metre(bench):
-    b = bench()
-    for k in range(101):
-        b.send('/odom', odometry(10**9 + k * 10**8, 0.05 * k))
-    b.map_of(11)
-    b.until(lambda: b.received['pose'][-1].header.stamp.sec == 11, 'the last one is answered')
-
-
-def test_a_saved_map_is_loaded_and_odometry_goes_on_from_its_end(bench, tmp_path):
+def test_where_a_map_is_loaded_odometry_goes_on_from_its_end(bench, tmp_path):
+    """The robot was switched off meanwhile: its odometry begins at 50 m, a part begins there."""
     b = bench(save_path=str(tmp_path / 'map.g2o'))
-    assert not call(b, 'save').success
     b.drive(0, 3)
     b.map_of(3)
-    assert call(b, 'save').success
-    assert call(b, 'reset').success
-    b.map_of(0)
-    answer = call(b, 'load')
-    assert answer.success and '3 keyframes' in answer.message
-    b.map_of(3)
-    # The robot was switched off meanwhile: its odometry begins at 50 m, a part begins there.
+    assert call(b, 'save').success and call(b, 'load').success
     b.send('/odom', odometry(10 * 10**9, 50.0))
     b.send('/odom', odometry(11 * 10**9, 50.1))
     b.until(lambda: len(b.received['pose']) == 5, 'both are answered')
@@ -79,20 +65,6 @@ def test_a_saved_map_is_loaded_and_odometry_goes_on_from_its_end(bench, tmp_path
     b.send('/odom', odometry(13 * 10**9, 51.1))
     b.until(lambda: b.received['pose'][-1].header.stamp.sec == 13, 'a pose after the update')
     assert b.received['pose'][-1].pose.position.x == pytest.approx(3.1)
-
-
-def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, tmp_path):
-    write_world(tmp_path / 'bag', 60, 90)
-    (tmp_path / 'broken.g2o').write_text('no graph')
-    b = bench(save_path=str(tmp_path / 'broken.g2o'), autosave_period=0.0, **EVERY_MESSAGE)
-    assert call(b, 'optimize').message == 'there are no factors yet'
-    b.play(tmp_path / 'bag')
-    b.map_of(60)
-    answer = call(b, 'optimize')
-    assert answer.success and 'L1 cost' in answer.message
-    answer = call(b, 'load')
-    assert not answer.success and 'broken.g2o:1' in answer.message
-    assert len(b.path().poses) == 60
 
 
 def test_optimize_takes_a_doubtful_map_and_says_so(bench, tmp_path, capsys):
@@ -121,6 +93,7 @@ def test_optimize_takes_a_doubtful_map_and_says_so(bench, tmp_path, capsys):
 def test_no_update_while_paused(bench):
     b = bench()
     pause(b, True)
+    assert call(b, 'optimize').message == 'there are no factors yet'
     b.send('/odom', odometry(10**9, 0.0))
     b.until(lambda: b.received['pose'], 'poses go on')
     ticks = len(b.received['map_to_odom'])
@@ -145,4 +118,5 @@ def test_the_solver_never_starves_the_callbacks_and_names_an_offset_of_loops(ben
     assert found.success or ' joins 2 parts of the map' in found.message
     assert call(b, 'load').success
     answer = call(b, 'optimize')
-    assert answer.success and '; loops share an offset of 0.' in answer.message
+    assert answer.success
+    assert 'L1 cost' in answer.message and '; loops share an offset of 0.' in answer.message

@@ -8,41 +8,47 @@
 # SPDX-License-Identifier: Apache-2.0
 """Strays of every kind to the real node: counted, told once, and not in the map."""
 
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
-from node_bench import loop, odometry, poses_of, warnings
+from node_bench import loop, odometry, warnings
 
 NS = 10**9
 NO_DOUBT = {'robust.enabled': False}
-CUT = [b'', b'\0\1\0\0', 40 * b'\7', b'\0\1\0\0' + 60 * b'\xff']
 
 
 def test_bad_messages_are_counted_and_the_node_goes_on(bench, capfd):
     b = bench()
     b.send('/odom', odometry(10**9, 0.0))
     b.send('/odom', odometry(10**9 - 5, 9.0))
-    for data in CUT:  # no messages at all
+    for data in b'', b'\0\1\0\0' + 60 * b'\xff':  # no messages at all
         b.send('/odom', data)
     b.send('/odom', odometry(2 * 10**9, float('nan')))
     b.send('/odom', odometry(2 * 10**9, 0.0, frame='camera'))
     b.send('/loop_closures', loop(2 * 10**9, frame='map'))
     b.send('/loop_closures', loop(2 * 10**9, 2e9))
-    b.send('/loop_closures', CUT[-1])
+    b.send('/loop_closures', b'\0\1\0\0' + 60 * b'\xff')
     b.send('/odom', odometry(3 * 10**9, 1.0))
     b.map_of(2)
-    expected = {'old_stamp': 1, 'encoding': 4, 'not_finite': 1, 'child_frame': 1, 'frame': 1,
+    expected = {'old_stamp': 1, 'encoding': 2, 'not_finite': 1, 'child_frame': 1, 'frame': 1,
                 'range': 1}
     b.until(lambda: b.refused() == expected, 'the bad ones are counted')
     level, sentence, values = b.status()
     assert level == DiagnosticStatus.WARN and '1 not_finite' in sentence
-    assert values['refused.encoding.last_minute'] == '4'
-    assert (values['odom.received'], values['loop_closures.received']) == ('9', '2')
-    assert len([line for line in warnings(capfd) if 'expected CDR' in line]) <= 1
+    assert values['refused.encoding.last_minute'] == '2'
+    assert (values['odom.received'], values['loop_closures.received']) == ('7', '2')
+    told = ''
+
+    def is_told(part):
+        nonlocal told
+        told += capfd.readouterr().err
+        return part in told
+
+    b.until(lambda: is_told('odometry stamp 999999995 ns came 5e-09 s late'), 'it is told')
+    assert told.count('expected CDR') <= 1
 
 
 @pytest.mark.parametrize('given, of_odometry, of_loops', [
@@ -93,36 +99,3 @@ def test_two_publishers_of_odometry_are_told_of(bench, capfd):
     assert len(told) == 1 and told[0].endswith(
         'messages of several publishers come by turns on odom, and the map takes them for one '
         'motion; expected one publisher')
-
-
-def test_strays_do_not_stop_the_map(bench, capfd):
-    """A first message of another robot, a stamp of tomorrow, a teleport, loops five times."""
-    b = bench(**NO_DOUBT)
-    b.send('/odom', odometry(5 * NS, 7.0, 'gripper'))
-    for k in range(10, 20):
-        b.send('/odom', odometry(k * NS, float(k)))
-        if k == 13:
-            b.send('/odom', odometry(k * NS + 86_400 * NS, float(k)))
-        if k == 15:
-            b.send('/odom', odometry(k * NS + NS // 2, 5e8))
-    for _ in range(5):
-        b.send('/loop_closures', loop(18 * NS, 7.0, 'base_link@11.000000000'))
-    expected = {'child_frame': 1, 'stamp_ahead': 1, 'jump': 1, 'repeated': 4}
-    b.until(lambda: b.refused() == expected, f'{expected} are counted')
-    assert np.allclose(poses_of(b.map_of(10))[:, 0], np.arange(10, 20), atol=1e-6)
-    b.until(lambda: max(p.header.stamp.sec for p in b.received['pose']) == 19,
-            'the newest pose is published')
-    # The very first was believed for as long as nothing spoke against it.
-    assert {p.pose.position.x for p in b.received['pose'][1:]} <= set(range(10, 20))
-    told = ''
-
-    def is_told(part):
-        nonlocal told
-        told += capfd.readouterr().err
-        return part in told
-
-    for part in ("odometry of 'gripper'; expected that of 'base_link'",
-                 'odometry stamp 86413000000000 ns is 86400 s after the one before',
-                 'odometry 5e+08 m from one message to the next',
-                 'a loop from 11000000000 ns to 18000000000 ns was sent before'):
-        b.until(lambda part=part: is_told(part), f'it is told: {part}')

@@ -22,22 +22,14 @@ from rcl_interfaces.srv import DescribeParameters, ListParameters
 import l1slam_ros as l1
 
 
-def test_a_shorter_period_of_the_updates_holds_at_once(bench):
-    b = bench(**{'update.period': 3600.0})
+def test_a_shorter_period_of_updates_holds_at_once_and_of_transforms_from_then_on(bench):
+    b = bench(**{'update.period': 3600.0, 'transform_period': 3600.0})
     b.drive(0, 3)
-    b.until(lambda: b.received['pose'], 'odometry is used')
-    assert not put(b, 'update.period', 0.05)
+    b.until(lambda: b.received['pose'] and b.received['map_to_odom'], 'odometry is used')
+    assert not put(b, 'update.period', 0.05) and not put(b, 'transform_period', 0.05)
     b.map_of(3)
     b.drive(3, 6)
     b.map_of(6)
-
-
-def test_a_shorter_period_of_the_transform_holds_from_the_next_odometry_on(bench):
-    b = bench(transform_period=3600.0)
-    b.drive(0, 1)
-    b.until(lambda: b.received['map_to_odom'], 'the transform is published')
-    assert not put(b, 'transform_period', 0.05)
-    b.drive(1, 2)
     count = len(b.received['map_to_odom'])
     b.until(lambda: len(b.received['map_to_odom']) > count + 4, 'it is published again and again')
 

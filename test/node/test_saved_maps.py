@@ -76,7 +76,7 @@ def first_half(b, bag):
     """Drive: with loops that were refused, struck out before and after, and that wait."""
     b.send('/loop_closures', between(20.0, 30.0, 1.0))
     b.play(bag)
-    b.until(lambda: len(b.path().poses) == 50, 'half of it')
+    b.map_of(50)
     b.send('/loop_closures', between(0.5, 4.0, 30.0, 1e-4))
     b.send('/trusted_loop_closures', between(0.7, 4.1, 3.0, 0.5))
     b.send('/absolute_poses', absolute(2.0, 20.0, 0.1))
@@ -86,6 +86,13 @@ def first_half(b, bag):
         b.send('/false_loop_closures', between(*struck, 3.0))
     b.send('/absolute_poses', absolute(6.0, 7.0, 1.0))
     b.send('/loop_closures', between(0.5, 7.0, 30.0, 1e-4))
+    b.rest()
+
+
+def second_half(b, bag):
+    b.send('/loop_closures', between(0.6, 3.2, 3.0))
+    b.play(bag)
+    b.map_of(80)
     b.rest()
 
 
@@ -110,7 +117,7 @@ def both(tmp_path_factory):
     def act(b):
         for first, last in (0, 5), (5, 6):
             b.drive(first, last)
-            b.until(lambda n=last: len(b.path().poses) == n, 'all of it')
+            b.map_of(last)
             b.rest()
             ask(b, 'save')
         return path
@@ -147,9 +154,10 @@ def test_what_is_loaded_is_what_was_saved_and_goes_on_as_if_nothing_had_been(
     assert [p.name for p in halfway.parent.iterdir()] == ['map.g2o']
     path = shutil.copy(halfway, tmp_path / 'map.g2o')
     loaded = at(bench, path, load_on_start=True)
-    loaded.until(lambda: len(loaded.path().poses) == 50, 'the map')
+    loaded.map_of(50)
     loaded.rest()
     assert loaded.count('updates') == 0, 'nothing is judged anew, nor improved'
+    assert len(loaded.received['path']) == 1
     np.testing.assert_allclose(poses_of(loaded.path()), read(path).poses, atol=1e-12)
     assert {'waiting', 'accepted', 'rejected'} == set(loaded.states())
     # Saved again, every line is as it was.
@@ -157,18 +165,12 @@ def test_what_is_loaded_is_what_was_saved_and_goes_on_as_if_nothing_had_been(
     assert not set_parameter(loaded, 'save_path', str(again))
     ask(loaded, 'save')
     assert_same_lines(again.read_text().splitlines()[:-1], path.read_text().splitlines()[:-1])
-    loaded.send('/loop_closures', between(0.6, 3.2, 3.0))
-    loaded.play(halves[1])
-    loaded.until(lambda: len(loaded.path().poses) == 80, 'the rest')
-    loaded.rest()
+    second_half(loaded, halves[1])
     found, poses = loaded.loops(), poses_of(loaded.path())
     loaded.close()
     undisturbed = at(bench, tmp_path / 'other.g2o')
     first_half(undisturbed, halves[0])
-    undisturbed.send('/loop_closures', between(0.6, 3.2, 3.0))
-    undisturbed.play(halves[1])
-    undisturbed.until(lambda: len(undisturbed.path().poses) == 80, 'the rest')
-    undisturbed.rest()
+    second_half(undisturbed, halves[1])
     np.testing.assert_allclose(poses_of(undisturbed.path()), poses, atol=1e-3)
     assert {ends: state for ends, (state, _) in undisturbed.loops().items()} == {
         ends: state for ends, (state, _) in found.items()}
@@ -288,7 +290,7 @@ def hold(path, name, value):
     proven(path, [*lines, *[f'#L1SLAM {name} {value}'] * bool(value)])
 
 
-def test_where_the_contents_are_wrong_or_cut_the_map_before_is_taken(bench, two, capsys):
+def test_where_the_contents_are_wrong_or_cut_the_map_before_is_taken(bench, two, capfd):
     whole, before = two.read_bytes(), two.with_name('map.g2o.1')
     b = at(bench, two)
     taken = f'5 keyframes loaded from {before}, the map before: {two}: '
@@ -298,8 +300,16 @@ def test_where_the_contents_are_wrong_or_cut_the_map_before_is_taken(bench, two,
             hold(two, name, value)
             said = ask(b, 'load')
             assert said.startswith(f'{taken}is a saved map with wrong contents: '), (name, said)
-            assert 'Traceback' not in run(capsys, 'info', two, code=None)[1]
+            assert 'Traceback' not in run(capfd, 'info', two, code=None)[1]
     good = before.read_bytes()
+    b.close()
+    b = at(bench, two, load_on_start=True)
+    b.map_of(5)
+    assert taken in capfd.readouterr().err
+    assert 'held another map' in ask(b, 'save')
+    assert before.read_bytes() == good, 'nonsense does not take its place'
+    two.write_bytes(whole)
+    hold(two, 'stamps', 'nonsense')
     before.write_bytes(two.read_bytes())
     answer = call(b, 'load')
     assert not answer.success and re.search('cannot be loaded: .*wrong contents.*wrong contents',
@@ -326,8 +336,7 @@ def test_a_part_begins_where_saved_stamps_do_not_rise(bench, two, stamps):
     hold(two, 'end', str(stamps[-1]))
     b = at(bench, two, load_on_start=True)
     b.send('/odom', odometry(20 * 10**9, 1.0))
-    b.until(lambda: len(b.path().poses) == 7, 'it goes on')
-    assert np.isfinite(poses_of(b.path())).all()
+    assert np.isfinite(poses_of(b.map_of(7))).all()
 
 
 def test_a_map_of_the_version_before_is_read(bench, two):
@@ -337,8 +346,7 @@ def test_a_map_of_the_version_before_is_read(bench, two):
     proven(two, ['#L1SLAM map 2', first.removesuffix(' #L1SLAM map 3'), *rest.split('\n')[:-2]])
     b = at(bench, two)
     assert ask(b, 'load') == f'6 keyframes loaded from {two}'
-    b.until(lambda: len(b.path().poses) == 6, 'the map')
-    np.testing.assert_array_equal(poses_of(b.path()), known.poses)
+    np.testing.assert_array_equal(poses_of(b.map_of(6)), known.poses)
 
 
 # The disk
@@ -349,7 +357,7 @@ def writer(bench, two):
     """Return a node that loaded the map of six keyframes, and has driven on."""
     b = at(bench, two, load_on_start=True)
     b.drive(6, 8)
-    b.until(lambda: len(b.path().poses) == 8, 'it drives on')
+    b.map_of(8)
     b.rest()
     return b
 

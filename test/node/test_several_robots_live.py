@@ -108,29 +108,6 @@ def test_a_robot_that_nothing_joins_is_published_in_its_own_map(bench):
         'in r2/map: nothing that is believed joins it to the first robot')
 
 
-def test_a_map_of_two_robots_is_loaded_by_their_names(bench, tmp_path):
-    team, path = Team(n=120, edges=400, lies=0), str(tmp_path / 'map.g2o')
-    b = bench(robots=NAMES[:2], save_path=path, **EVERY_MESSAGE)
-    play(b, team)
-    settled(b, True)
-    b.until(lambda: len(b.path('r2/').poses) == 60, 'all of it')
-    b.rest()
-    assert call(b, 'save').success
-    second = poses_of(b.path('r2/'))
-    b.close()
-    b = bench(robots=NAMES[1::-1], save_path=path, load_on_start=True, **EVERY_MESSAGE)
-    b.until(lambda: len(b.path('r2/').poses) == 60,
-            'the map is back')
-    # The second one is the first now: its frame is that of the map.
-    np.testing.assert_allclose(poses_of(b.path('r2/')), between(second[0], second),
-                               atol=1e-6)
-    # It goes on, from elsewhere: a new part of the same robot.
-    for k in range(3):
-        b.send('/r2/odom', odometry((1000 + k) * 10**9, 1.0 * k))
-    b.until(lambda: len(b.path('r2/').poses) == 63, 'it drives on')
-    assert len(b.path('r1/').poses) == 60
-
-
 def test_loops_of_robots_that_nobody_named_are_counted_and_the_first_are_said(bench, capfd):
     b = bench(robots=NAMES[:2], **EVERY_MESSAGE)
     b.send('/r1/odom', odometry(10**9, 0.0))

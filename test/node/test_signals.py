@@ -70,15 +70,6 @@ def test_while_it_is_being_imported(start, number, first):
     assert_ends(process, number)
 
 
-@pytest.mark.parametrize('delay', [0.2, 0.6, 1.0])
-def test_at_any_moment_of_its_start(start, delay):
-    process = start()
-    until(lambda: catches(process, signal.SIGTERM), 'it takes signals')
-    moment = time.monotonic() + delay
-    until(lambda: time.monotonic() > moment, 'it is on its way')
-    assert_ends(process, signal.SIGINT)
-
-
 def test_while_it_compiles_all_else_is_served(start, ros, tmp_path):
     path = tmp_path / 'map.g2o'
     process = start('--ros-args', '-p', f'save_path:={path}', NUMBA_CACHE_DIR=str(tmp_path))

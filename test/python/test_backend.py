@@ -47,21 +47,6 @@ def cost(graph, poses):
     return np.abs(whitened(graph, poses)).sum()
 
 
-def test_incremental_ends_at_the_cost_of_batch(graph, best):
-    """Within 2 parts in 10,000; on the way each update ends within 1%."""
-    with l1.Backend(EVERY) as backend:
-        for k in range(0, 150, 10):
-            play(backend, graph, k, k + 10)
-            improvement = backend.update(PLENTY)
-            assert improvement.cost <= improvement.cost_before
-            if k in (40, 90, 140):
-                now = backend.snapshot().graph
-                batch = l1.solve(now, robust=False)
-                assert cost(now, backend.poses) == pytest.approx(batch.cost, rel=1e-2)
-        settled(backend)
-        assert cost(graph, backend.poses) == pytest.approx(best, rel=2e-4)
-
-
 @pytest.mark.parametrize('options', [EVERY, CREDULOUS], ids=['robust', 'credulous'])
 def test_settled_the_map_is_the_optimum_and_all_loops_are_judged(graph, best, options):
     with l1.Backend(options) as backend:
@@ -77,18 +62,12 @@ def test_settled_the_map_is_the_optimum_and_all_loops_are_judged(graph, best, op
 
 
 def test_a_settle_minimises_the_norms_that_were_asked_for(graph):
-    found = []
-    for norms in ({'norm': 'l2', 'loop_norm': 'l1'}, {'norm': 'l1'}):
-        backend = begun({**EVERY_MESSAGE, 'solver': norms})
-        play(backend, graph)
-        backend.settle()
-        rows = whitened(graph, backend.poses)
-        odometry = graph.between.is_odometry
-        found.append((rows[odometry] ** 2).sum() / 2 + np.abs(rows[~odometry]).sum())
-    mixed, plain = found
-    assert mixed < 0.99 * plain
-    assert mixed == pytest.approx(
-        l1.solve(graph, norm='l2', loop_norm='l1', robust=False).cost, rel=1e-6)
+    norms = {'norm': 'l2', 'loop_norm': 'l1'}
+    backend = begun({**EVERY_MESSAGE, 'solver': norms})
+    play(backend, graph)
+    best = l1.solve(graph, robust=False, **norms)
+    assert backend.settle().cost == pytest.approx(best.cost, rel=1e-6)
+    assert_allclose(backend.poses, best.poses, atol=1e-3)
 
 
 @pytest.mark.parametrize('dimension', [4, 0])
@@ -165,34 +144,10 @@ def test_options_may_change_on_the_way():
     assert 30 <= len(backend.poses) <= 31
 
 
-def test_how_far_the_work_is_behind_is_said(graph, best):
-    backend = played(graph, 0, 100)
-    assert len(states(backend)) > 20
-    behind = backend.behind()
-    assert np.isnan([behind.age, behind.bound]).all()
-    assert behind.loops == len(states(backend)) and not behind.failing
-    settled(backend)
-    behind = backend.behind()
-    assert (behind.rows, behind.loops) == (0, 0) and 0 <= behind.age < PLENTY
-    play(backend, graph, 100, 104)
-    rows = []
-    backend.update(PLENTY, taken=lambda: rows.append(backend.behind().rows))
-    assert 0 < rows[0] <= 3 * len(states(backend))
-    play(backend, graph, 104)
-    backend.settle()
-    behind = backend.behind()
-    assert 0.99 * best < behind.bound <= best * (1 + 1e-9) and 0 <= behind.bound_age < PLENTY
-
-
 def test_each_loop_has_a_state_and_its_own_stamps(graph):
     backend = begun({**EVERY_MESSAGE, 'loop': {'wait': 3.0}})
-    assert states(backend) == {}
     backend.add_loop(loop(0.0, 1e6, (1.0, 0.0, 0.0)))
-    backend.add_loop(loop(1.0, 20.0, (1.0, 0.0, 0.0)))
-    play(backend, graph, 0, 25)
-    backend.update(PLENTY)
-    assert states(backend)[0.0, 1e6] == states(backend)[1.0, 20.0] == 'waiting'
-    play(backend, graph, 25, 60)
+    play(backend, graph, 0, 60)
     backend.add_loop(loop(2.0, 50.0, (1.0, 0.0, 0.0)))
     backend.update(PLENTY)
     found = backend.loop_states()
@@ -202,36 +157,10 @@ def test_each_loop_has_a_state_and_its_own_stamps(graph):
     assert_array_equal(found.robots, 0)
     assert np.isfinite(found.sigmas[:len(rows)]).all()
     assert np.isnan(found.sigmas[len(rows):]).all()
-    others = {key: state for key, state in states(backend).items()
-              if state not in ('accepted', 'rejected', 'suspect')}
-    assert others == {(0.0, 1e6): 'expired', (1.0, 20.0): 'expired', (2.0, 50.0): 'waiting'}
+    assert states(backend)[0.0, 1e6] == 'expired' and states(backend)[2.0, 50.0] == 'waiting'
     sizes = backend.counts().sizes
     assert sizes['keyframes'] == 60 and sizes['factors'] == len(factors) == 59 + len(rows)
-    assert (sizes['waiting_loops'], sizes['expired_loops']) == (1, 2)
-
-
-def test_a_loop_that_carries_all_it_closes_a_long_way_by_is_no_corner_to_stay_in():
-    """No reweighted step from there lowers the cost: the updates that followed did nothing."""
-    n, sigma = 300, np.array([0.02, 0.02, 0.02, 0.0005, 0.0005, 0.001])
-    backend, rng = l1.Backend(CREDULOUS, 3), np.random.default_rng(2)
-    manifold, step = backend.manifold, np.zeros((n - 1, 6))
-    step[:, 0], step[:, 5] = 1.0, 2 * np.pi / n
-    chains = []
-    for steps in (step, step + sigma * rng.standard_normal(step.shape)):
-        poses = manifold.identity(n)
-        for k, move in enumerate(manifold.retract(manifold.identity(n - 1), steps), 1):
-            poses[k] = manifold.compose(poses[k - 1], move)
-        chains.append(poses)
-    true, drifted = chains
-    for k, pose in enumerate(drifted):
-        backend.add_odometry(l1.OdometrySample(seconds(k), pose, np.diag(sigma**2), np.eye(6)))
-    backend.add_loop(l1.LoopClosure(0, seconds(n - 1), manifold.between(true[0], true[-1]),
-                                    np.diag(np.repeat([0.1, 0.005], 3)**2)))
-    found = backend.update(PLENTY)
-    best = l1.solve(backend.snapshot().graph, robust=False, start=true).cost
-    off = manifold.local(*(manifold.between(ends[0], ends[-1]) for ends in chains))
-    assert best < 0.9 * np.abs(off / np.repeat([0.1, 0.005], 3)).sum()
-    assert found.cost < 1.05 * best
+    assert (sizes['waiting_loops'], sizes['expired_loops']) == (1, 1)
 
 
 @pytest.mark.parametrize('change, words', [

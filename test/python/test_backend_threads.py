@@ -179,27 +179,29 @@ def test_what_has_come_is_in_the_map_before_any_work_behind_begins(graph):
     backend.close()
 
 
-@pytest.mark.parametrize('interrupt', ['reset', 'settle', 'close', 'stopped'])
-def test_an_update_is_interrupted_at_once(graph, interrupt):
+@pytest.mark.parametrize('interrupt', ['reset', 'settle', 'close', 'stopped', 'settle stopped'])
+def test_work_is_interrupted_at_once(graph, interrupt):
     """What needs no solver does not interrupt it, and is not held up."""
-    backend = played(graph, 0, 100)
+    backend, stops = played(graph, 0, 100), interrupt.endswith('stopped')
     begun, stop, ended = threading.Event(), threading.Event(), []
 
     def stopped():
         """Be asked now and then by who works: this takes its time."""
         begun.set()
         stop.wait(MOMENT)
-        return interrupt == 'stopped' and stop.is_set()
+        return stops and stop.is_set()
 
     def update():
         with pytest.raises(Exception, match='^$') as caught:
+            if interrupt == 'settle stopped':
+                backend.settle(stopped)
             backend.update(DEADLINE, stopped)
         ended.append(type(caught.value).__name__)
 
     updating = meanwhile(update)
     assert begun.wait(DEADLINE)
     assert len(backend.poses) == 100 and updating.is_alive()
-    if interrupt != 'stopped':
+    if not stops:
         getattr(backend, interrupt)()
     stop.set()
     updating.join(DEADLINE)
@@ -209,31 +211,6 @@ def test_an_update_is_interrupted_at_once(graph, interrupt):
         best = l1.solve(backend.snapshot().graph).cost
         assert np.abs(whitened(backend.snapshot().graph, backend.poses)).sum() == pytest.approx(
             best, rel=1e-6)
-
-
-def test_a_settle_can_be_stopped_at_many_moments(graph):
-    backend, asked = played(graph), []
-    poses, saved = backend.poses, backend.saved()
-    best = backend.settle(lambda: bool(asked.append(1))).cost
-    whole = len(asked)
-    assert whole > 10
-    for limit in np.linspace(0, whole - 2, 6).astype(int).tolist():
-        backend.restore(saved)
-        asked.clear()
-        with pytest.raises(Exception, match='^$') as caught:
-            backend.settle(lambda limit=limit: asked.append(1) or len(asked) > limit)
-        assert type(caught.value).__name__ == 'Interrupted' and len(asked) <= limit + 3
-        np.testing.assert_array_equal(backend.poses, poses)
-    assert backend.settle().cost == pytest.approx(best, rel=1e-9)
-
-
-def test_several_threads_may_settle_at_once(graph):
-    backend, found = played(graph), []
-    threads = [meanwhile(lambda: found.append(backend.settle())) for _ in range(4)]
-    for thread in threads:
-        thread.join(DEADLINE)
-    assert len(found) == 4 and {len(one.poses) for one in found} == {150}
-    assert [one.cost for one in found] == pytest.approx(4 * [found[0].cost], rel=1e-6)
 
 
 def test_what_one_thread_sees_is_of_one_map_whatever_others_do():

@@ -35,11 +35,6 @@ def test_a_drift_is_taken_beyond_what_the_odometry_states(lies, drift, taken):
     assert found.error < 0.1 and not found.slips
 
 
-def test_a_drift_that_dense_loops_hold_is_none():
-    found = solved(careful(300, 800).drifting(-0.004))
-    assert DOUBT not in found.doubts and found.error < 0.1
-
-
 def test_of_laps_that_are_no_circles_the_drift_that_leaves_the_least_noise_is_taken():
     """By a turn less on each lap all loops fit, too, in a map that is 40 m off."""
     drift = 2 * np.pi / 200

@@ -6,17 +6,16 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""`FactorGraph`: append-only, snapshots that stay valid, robots, and what it refuses."""
+"""`FactorGraph`: append-only, snapshots that stay valid, and what it refuses."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from worlds import between, compose
 
 import l1slam_ros as l1
 
 PLANE = l1.Backend().manifold
-WORLD = NO_PREDECESSOR = -1
+WORLD = -1
 ONE = np.eye(3)
 
 
@@ -116,21 +115,14 @@ UNKNOWN = 'a factor names keyframe {}, the graph has 0 to 2'
 @pytest.mark.parametrize('i, j, value, information, said', [
     (3, 0, 0.0, ONE, UNKNOWN.format(3)),
     (-2, 0, 0.0, ONE, UNKNOWN.format(-2)),
-    (-1, 3, 0.0, ONE, UNKNOWN.format(3)),
     (0, -1, 0.0, ONE, UNKNOWN.format(-1)),
-    (-1, -1, 0.0, ONE, 'keyframe -1 has a factor to itself'),
     (2, 2, 0.0, ONE, 'keyframe 2 has a factor to itself'),
     (1, 2, np.nan, ONE, 'measurement 1 is not finite: [ 0. nan  0.]'),
-    (1, 2, np.inf, ONE, 'measurement 1 is not finite: [ 0. inf  0.]'),
-    (-1, 2, 0.0, [[1, 0.1, 0], [0.1, 0, 0], [0, 0, 1]],
-     'matrix 1 is not positive definite: [1 0.1 0; 0.1 0 0; 0 0 1]'),
     (1, 2, 0.0, [[1, 2, 0], [2, 1, 0], [0, 0, 1]],
      'matrix 1 is not positive definite: [1 2 0; 2 1 0; 0 0 1]'),
     (1, 2, 0.0, 0 * ONE, 'matrix 1 is not positive definite: [0 0 0; 0 0 0; 0 0 0]'),
-    (1, 2, 0.0, -ONE, 'matrix 1 is not positive definite: [-1 -0 -0; -0 -1 -0; -0 -0 -1]'),
     (1, 2, 0.0, bad(0, 1, 0.5), 'matrix 1 is not symmetric: [1 0.5 0; 0 1 0; 0 0 1]'),
     (1, 2, 0.0, bad(1, 1, np.nan), 'matrix 1 is not finite: [1 0 0; 0 nan 0; 0 0 1]'),
-    (1, 2, 0.0, bad(1, 1, np.inf), 'matrix 1 is not finite: [1 0 0; 0 inf 0; 0 0 1]'),
     (1, 2, 0.0, bad(1, 1, 1e31),
      'matrix 1 is not within 1e-30 to 1e+30 on its diagonal: [1 0 0; 0 1e+31 0; 0 0 1]'),
 ])
@@ -155,28 +147,3 @@ def test_arrays_that_do_not_fit_together_are_refused(shape):
         graph.add_between(np.array([0, 1]), np.array([1, 2]), np.zeros(shape),
                           np.array([ONE, ONE]))
     assert not len(graph.between)
-
-
-def test_keyframes_of_several_robots_come_in_any_order(rng):
-    graph, truth, root = l1.FactorGraph(PLANE), rng.uniform(-3, 3, (6, 3)), 2 * ONE[None]
-    for robot in 0, 1:
-        graph.add_poses(1, robot, begins_part=True)
-    for k, robot in (2, 0), (3, 1), (4, 1), (5, 0):
-        before = np.flatnonzero(graph.robot == robot)[-1]
-        graph.append_step(between(truth[before:before + 1], truth[k:k + 1]), root, robot)
-    i, j = np.array([1, 3]), np.array([2, 5])
-    graph.add_between(i, j, between(truth[i], truth[j]), np.tile(4 * root / 2, (2, 1, 1)))
-    assert graph.robot.tolist() == [0, 1, 0, 1, 1, 0]
-    assert graph.predecessor.tolist() == [NO_PREDECESSOR, NO_PREDECESSOR, 0, 1, 3, 2]
-    assert graph.firsts.tolist() == [1]
-    assert graph.parent.tolist() == [0, 1, 0, 1, 3, 2]
-    factors = graph.between
-    # One loop joins neighbours in the order of their indices.
-    assert factors.is_odometry.tolist() == 4 * [True] + 2 * [False]
-    assert factors.step_to.tolist() == [-1, -1, 0, 1, 2, 3]
-    assert graph.subset(np.array([3, 4])).between.is_odometry.tolist() == [True, False]
-    # Both robots' keyframes are one map.
-    poses = l1.solve(graph, robust=False).poses
-    motion = compose(poses[:1], between(truth[:1], np.zeros((1, 3))))
-    assert_allclose(between(np.array([compose(motion[0], pose) for pose in truth]), poses), 0,
-                    atol=1e-6)

@@ -9,15 +9,12 @@
 """Options: what a mapping or a parameter file may set, types, ranges and choices."""
 
 import math
-from pathlib import Path
 
 import pytest
-import yaml
 from command import run, solve_json
 
 import l1slam_ros as l1
 
-SHIPPED = Path(__file__).parents[2] / 'config' / 'backend.yaml'
 # Name -> the least and the largest value.
 RANGES = {
     'keyframe.translation': (0, 1e6), 'keyframe.rotation': (0, 1e6), 'keyframe.period': (0, 1e9),
@@ -110,20 +107,6 @@ def test_a_mapping_of_nonsense_is_refused(values, said):
 
 
 # Parameter files
-
-
-def test_the_shipped_file_sets_the_defaults_and_names_every_option():
-    shipped = yaml.safe_load(SHIPPED.read_text())['/**']['ros__parameters']
-    of_ros = {'use_sim_time': True, 'qos_overrides': {'/odom': {'subscription': {'depth': 5}}}}
-    assert l1.BackendOptions.from_mapping(shipped | of_ros) == l1.BackendOptions()
-    for name in (*RANGES, *CHOICES):
-        found = shipped
-        for part in name.split('.'):
-            found = found[part]
-        assert found == value_of(name, l1.BackendOptions())
-    shipped['keyframe']['translation'] = 2.0
-    assert l1.BackendOptions.from_mapping(shipped) == options(keyframe={'translation': 2.0})
-    assert refused(shipped | {'use_time': True}) == 'no option is called use_time'
 
 
 @pytest.fixture

@@ -107,27 +107,6 @@ def test_no_number_of_a_robot(robot):
 # Robots that begin their odometry again on the way
 
 
-@pytest.mark.parametrize(('world', 'most'), [('streets', 0.5), ('building', 0.8)])
-def test_three_robots_that_restart_have_the_loops_of_the_batch(world, most):
-    team = Restarts(30, n=180, edges=630, lies=60, world=world)
-    backend = l1.Backend(EVERY, 2 if world == 'streets' else 3)
-    for robot, message in team.messages():
-        fill(backend, [(robot, message)])
-        if robot == 0 and isinstance(message, l1.OdometrySample):
-            backend.update(0.0)
-    backend.settle()
-    now = backend.snapshot().graph
-    assert now.robot[now.firsts].tolist() == [1, 2, 1, 2]
-    assert backend.counts().told == {'new_part': 2}
-    expected = team.believed(team.firsts) & loops_by(backend)
-    found = loops_by(backend, 'accepted')
-    assert len(expected) > 300 and len(expected ^ found) <= 0.01 * len(expected)
-    for robot in range(3):
-        poses = poses_of(backend, robot)
-        assert backend.robot(robot).joined and len(poses) == 60
-        assert team.error(poses, robot) < most
-
-
 @pytest.mark.parametrize('joined_first', [0, 1])
 def test_a_new_part_stands_where_its_robot_was_and_goes_with_it(joined_first):
     """Keyframes of others come between; what joins one part moves both."""
