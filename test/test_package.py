@@ -22,6 +22,7 @@ from email import message_from_bytes
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from environments import (
     environment,
@@ -44,7 +45,7 @@ OF_ROS = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'na
 # EmPy comes without a wheel.
 COLCON = ('colcon-bash', 'colcon-output', 'colcon-ros', 'setuptools<80', '--no-binary=empy')
 
-# What `l1slam` makes of one small world, run in a folder of its own.
+# What `l1slam` makes of one small world, run in a folder of its own; by the argument also costs.
 SMOKE = """
 import contextlib, importlib.util, io, json, sys
 import numpy
@@ -64,12 +65,16 @@ run('simulate', 'world.g2o', '--poses', '150', '--edges', '250', '--seed', '7')
 run('convert', 'world.g2o', 'bag')
 run('convert', 'bag', 'back.g2o')
 odometry = ('--start', 'odometry', '--outer', '0')
+with open('back.g2o') as file:
+    edges = [list(map(float, line.split()[1:])) for line in file if line.startswith('EDGE')]
 print(json.dumps({
     'python': '%d.%d' % sys.version_info[:2],
     'numpy': numpy.__version__,
     'ros': importlib.util.find_spec('rclpy') is not None,
+    'edges': edges,
     'costs': [cost('world.g2o', *odometry), cost('bag', *odometry), cost('back.g2o', *odometry),
-              cost('world.g2o', '--norm', 'l2'), cost('world.g2o', '--outer', '3')],
+              cost('world.g2o', '--norm', 'l2'), cost('world.g2o', '--outer', '3')
+              ] if 'solve' in sys.argv else [],
 }))
 """
 
@@ -187,7 +192,8 @@ def lowest(requirement):
 
 
 @pytest.mark.parametrize('version', ['3.10', '3.11', '3.12'])
-def test_every_python_comes_to_the_same_costs(wheel, requirements, version, tmp_path):
+def test_every_python_makes_the_same_map(wheel, requirements, version, tmp_path):
+    """On the oldest one it is solved, too, which compiles for a minute."""
     python = interpreter(version)
     if python is None:
         pytest.skip(f'no Python {version} on this machine')
@@ -198,13 +204,17 @@ def test_every_python_comes_to_the_same_costs(wheel, requirements, version, tmp_
     needed = environment(*(map(lowest, requirements) if oldest else requirements), python=python)
     fresh = new_environment(tmp_path / 'fresh', python, below=needed)
     fresh.install('--no-index', wheel.filename)
-    found = json.loads(fresh.run('python', '-c', SMOKE, cwd=tmp_path))
+    solve = ['solve'] * oldest
+    found = json.loads(fresh.run('python', '-c', SMOKE, *solve, cwd=tmp_path))
     assert found['python'] == version and not found['ros']
     assert found['numpy'].startswith('1.26.' if oldest else '2.')
     # Compilers order sums differently, and a solver stops within 10^-6 of the optimum.
     (tmp_path / 'here').mkdir()
-    here = json.loads(run(sys.executable, '-c', SMOKE, cwd=tmp_path / 'here', env={**os.environ}))
+    here = json.loads(run(sys.executable, '-c', SMOKE, *solve, cwd=tmp_path / 'here',
+                          env={**os.environ}))
     assert found['costs'] == pytest.approx(here['costs'], rel=1e-6)
+    np.testing.assert_allclose(found['edges'], here['edges'], rtol=1e-9, atol=1e-9)
+    assert len(here['edges']) == 250
 
 
 @pytest.mark.parametrize('kind', ['editable', 'wheel'])
