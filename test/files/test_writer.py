@@ -157,23 +157,6 @@ def contents(bag):
     return {file.name: file.read_bytes() for file in bag.iterdir()}
 
 
-def interrupt():
-    raise KeyboardInterrupt
-
-
-def test_a_former_bag_stays_until_the_new_one_is_complete(tmp_path, bag, write, monkeypatch):
-    before = contents(bag)
-    with monkeypatch.context() as patch:
-        Disk(patch, tmp_path, seen=interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            write(bag, 2)
-    assert contents(bag) == before
-    write(bag, 2)
-    assert count(bag) == 2
-    assert {p.name for p in bag.iterdir()} == {'metadata.yaml', 'bag.mcap'}
-    assert list(bag.parent.iterdir()) == [bag]
-
-
 # Both files, then their folder; the two renamings, then the folder around it.
 CALLS = ['open', 'open', 'fsync', 'fsync', 'fsync', 'rename', 'rename', 'fsync']
 
