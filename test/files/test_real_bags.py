@@ -63,11 +63,10 @@ def test_every_kind_is_the_same_recording(tmp_path, capsys, graph_of, world, kin
     assert f'duration    {(last - first) / 1e9:.1f} s from {first / 1e9:.9f}\n' in said
 
 
-@pytest.mark.parametrize('note', [
-    'a word', '[1, 2]', '{turned_loops: a -1 99999999999999999999, turned_steps: [3]}'])
-def test_a_note_that_says_nothing_is_none(tmp_path, graph_of, world, note):
-    path = rosbag2_directory(tmp_path / 'a', world[1], StoragePlugin.MCAP, note=note)
-    assert_same_graph(graph_of(path, every=True), world[2])
+def test_a_note_that_says_nothing_is_none(tmp_path, graph_of, world):
+    for k, note in enumerate(('a word', '{turned_loops: a -1 99999999999999999999}')):
+        path = rosbag2_directory(tmp_path / f'{k}', world[1], StoragePlugin.MCAP, note=note)
+        assert_same_graph(graph_of(path, every=True), world[2])
 
 
 def test_a_robot_without_our_note_goes_by_the_defaults_of_the_node(tmp_path, world):
@@ -151,44 +150,15 @@ def test_duplicates_and_a_clock_set_back_are_counted_and_told(tmp_path, graph_of
     assert len(record.graph.between) == len(read(world[0]).graph.between) + len(again) - 1
 
 
-def changed(message, change):
-    topic, msgtype, time, data = message
-    decoded = TYPES.deserialize_cdr(data, msgtype)
-    change(decoded)
-    return topic, msgtype, time, bytes(TYPES.serialize_cdr(decoded, msgtype))
-
-
-def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, graph_of, world):
-    recording = list(world[1])
-
-    def broken(k, change):
-        recording[k] = changed(recording[k], change)
-
-    odometry = [k for k, m in enumerate(recording) if m[0] == '/odom']
-    loops = [k for k, m in enumerate(recording) if m[0] == '/loop_closures']
-    broken(odometry[50], lambda m: setattr(m.pose.pose.position, 'x', np.nan))
-    broken(odometry[60], lambda m: setattr(m.header.stamp, 'sec', 0))
-    broken(loops[3], lambda m: setattr(m.header, 'frame_id', 'map'))
-    broken(loops[4], lambda m: setattr(m.header.stamp, 'sec', 2_000_000))
-    record = graph_of(mcap_file(tmp_path / 'a.mcap', recording), every=True)
-    for said, start in zip(sorted(record.skipped), [
-            '1 loop not used: the odometry ends before its times',
-            "1 message refused: frame 'map' of a loop; expected base_link@",
-            '1 message refused: pose (nan, ', '1 message refused: stamp 0 s 0 ns; expected'],
-            strict=True):
-        assert said.startswith(start)
-    assert all('expected' in sentence for sentence in record.skipped if 'refused' in sentence)
-    assert record.graph.n_poses == 118
-
-
 def test_faults_of_the_odometry_are_told(tmp_path, graph_of, world):
     """A jump, a stamp ahead, a restart, a variance of 1e12, and a last message on its own."""
     def moved(x, sec, k, index=-1, variance=0.0):
-        def change(m):
-            m.pose.pose.position.x += x
-            m.header.stamp.sec += sec
-            m.pose.covariance = np.where(np.arange(36) == index, variance, m.pose.covariance)
-        recording[k] = changed(recording[k], change)
+        topic, kind, time, data = recording[k]
+        m = TYPES.deserialize_cdr(data, kind)
+        m.pose.pose.position.x += x
+        m.header.stamp.sec += sec
+        m.pose.covariance = np.where(np.arange(36) == index, variance, m.pose.covariance)
+        recording[k] = topic, kind, time, bytes(TYPES.serialize_cdr(m, kind))
 
     recording = [m for m in world[1] if m[0] == '/odom']
     moved(3e8, 0, 30)
