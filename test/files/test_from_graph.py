@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from command import run
 from numpy.testing import assert_array_equal
-from problems import random_information, random_poses
 from records import information_of, read
 from rosbags.highlevel import AnyReader
 from worlds import write_g2o
@@ -134,14 +133,17 @@ def test_loops_that_are_trusted_or_struck_out_have_their_own_topics(tmp_path, re
 @pytest.mark.parametrize('size', [3, 6])
 def test_factors_from_later_keyframes_to_earlier_ones_come_back(tmp_path, rng, size):
     pairs = np.array([(1, 0), (2, 1), (2, 3), (4, 3), (2, 0), (-1, 3), (1, 4), (3, 0), (1, 0),
-                      (4, 2)])
+                      (4, 2), (-1, 0), (-1, 2), (0, 2)])
     trusted = np.arange(len(pairs)) == 4
     A = rng.normal(size=(len(pairs), size, size))
     Z = 0.8 * rng.normal(size=(len(pairs), 3 if size == 3 else 7))
     Z[:, 3:] = np.array([0, 0, 0, 1])[:Z.shape[1] - 3] + 0.4 * Z[:, 3:]
     Z[:, 3:] /= np.linalg.norm(Z[:, 3:], axis=1, keepdims=True) if size == 6 else 1
-    record = read(write_g2o(tmp_path / 'a.g2o', pairs, Z,
-                            A @ A.transpose(0, 2, 1) + 0.1 * np.eye(size)),
+    information = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(size)
+    if size == 3:  # of a position, of a heading, and of a loop that says nothing of one way
+        Z[10, 2] = 0.0
+        information[10:] = np.diag([4.0, 9, 0]), np.diag([0, 0, 25.0]), np.diag([0, 4.0, 9])
+    record = read(write_g2o(tmp_path / 'a.g2o', pairs, Z, information),
                   rotation_information='angle')
     record.graph.say(np.array([4]), trusted=True)
     record.write(tmp_path / 'bag')
@@ -152,8 +154,8 @@ def test_factors_from_later_keyframes_to_earlier_ones_come_back(tmp_path, rng, s
     assert_array_equal(back.pairs[rows], of.pairs)
     assert_array_equal(back.trusted[rows], trusted)
     np.testing.assert_allclose(back.measurement[rows], of.measurement, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.inv(information_of(found))[rows],
-                               np.linalg.inv(information_of(record.graph)), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(information_of(found)[rows], information_of(record.graph),
+                               rtol=1e-9, atol=1e-9)
 
 
 def test_a_loop_that_stands_twice_number_for_number_is_meant(tmp_path, capsys, record_of):
@@ -194,22 +196,3 @@ def test_no_keyframe_is_no_bag_and_one_is(tmp_path, record_of):
     assert list(tmp_path.iterdir()) == []
     l1.write_graph(tmp_path / 'bag', l1.FactorGraph(manifold, 1), np.zeros((1, 3)))
     assert [topic for topic, _, _ in read_with_rosbags(tmp_path / 'bag')] == ['/odom']
-
-
-def test_absolute_poses_come_back_as_they_went(tmp_path, record_of, rng):
-    record = record_of([(0, 1), (1, 2)])
-    graph, measured = record.graph, random_poses(3, rng)
-    measured[1, 2] = 0.0
-    graph.add_between(np.full(3, -1), np.array([1, 0, 2]), measured, np.stack(
-        [random_information(1, rng)[0], np.diag([4.0, 9, 0]), np.diag([0, 0, 25.0])]))
-    graph.add_between(np.array([0]), np.array([2]), measured[:1], np.diag([0, 4.0, 9])[None])
-    record.write(tmp_path / 'bag')
-    found = read(tmp_path / 'bag')
-    assert found.skipped == ()
-    mine, theirs = graph.between, found.graph.between
-    for factors in mine, theirs:
-        assert factors.is_absolute.sum() == 3
-    order = np.lexsort((mine.i, mine.j)), np.lexsort((theirs.i, theirs.j))
-    for name in ('i', 'j', 'measurement', 'sqrt_information'):
-        np.testing.assert_allclose(getattr(mine, name)[order[0]], getattr(theirs, name)[order[1]],
-                                   atol=1e-9)

@@ -154,16 +154,6 @@ def test_a_key_beyond_63_bits_is_one_line(capsys, tmp_path, truth, keys):
     assert f'an edge of keyframe {max(keys)}; expected numbers up to 2^63 - 1' in out
 
 
-def test_who_read_no_loops_is_told_of_the_graphs(bag):
-    assert read(bag).skipped == (
-        'no loop is in the map, but there are loops in 1 message on /kimera/pose_graph and 6 '
-        'messages on /rtabmap/mapGraph; expected --loop-topic /kimera/pose_graph or --loop-topic '
-        '/rtabmap/mapGraph',)
-    for topics in ({'loop_topic': '/rtabmap/mapGraph'}, {'odom_topic': '/rtabmap/mapGraph'},
-                   {'odom_topic': '/kimera/pose_graph'}):
-        assert read(bag, **topics).skipped == ()
-
-
 def test_who_has_no_odometry_is_told_of_the_graph(bag):
     said = f'0 keyframes from /none; .*{MAP_GRAPH} is on /rtabmap'
     with pytest.raises(l1.L1SlamError, match=said):

@@ -24,15 +24,6 @@ def bag(tmp_path_factory):
     return simulated_bag(tmp_path_factory.mktemp('world') / 'bag', 5, 5)
 
 
-def test_what_is_in_a_bag_is_listed(capsys, bag):
-    for path in (bag, bag / 'bag.mcap'):
-        assert run(capsys, 'info', path)[0].splitlines()[:4] == [
-            'duration    0.4 s from 1000.000000000',
-            'note        covariance increment, keyframes every',
-            'topic       /loop_closures: 1 of geometry_msgs/msg/PoseWithCovarianceStamped',
-            'topic       /odom: 5 of nav_msgs/msg/Odometry']
-
-
 def test_an_empty_bag(capsys, tmp_path):
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         writer.add_connection('/a', STRING, typestore=TYPES)
