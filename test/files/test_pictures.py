@@ -49,18 +49,6 @@ def extent_of_blue(path):
     return np.ptp(blue[blue[:, 0] < 0.85 * len(pixels(path))], axis=0)
 
 
-def test_maps_stand_beside_each_other(capsys, tmp_path):
-    path, sizes = graph(tmp_path / 'a.g2o'), []
-    for count in (1, 2, 4):
-        run(capsys, 'plot', *[path] * count, '--output', tmp_path / 'a.png', '--force')
-        height, width, _ = pixels(tmp_path / 'a.png').shape
-        sizes.append((width, height))
-    assert sizes[1][0] > 1.5 * sizes[0][0] and sizes[2][1] > 1.5 * sizes[1][1]
-    # The map of a solve, and beside it its costs on a logarithmic scale.
-    run(capsys, 'solve', path, '--no-robust', '--plot', tmp_path / 'both.png')
-    assert pixels(tmp_path / 'both.png').shape[1] > 1.6 * sizes[0][0]
-
-
 def test_refused_loops_are_red_and_false_ones_are_not_and_each_is_named(capsys, tmp_path):
     path, solved = graph(tmp_path / 'a.g2o', loops=[(0, 2), (1, 3)]), tmp_path / 'solved.g2o'
     l1.write_graph(solved, *l1.read_graph(path), inliers=np.arange(6) != 4)

@@ -16,7 +16,6 @@ from pose_graphs import (
     GLOBAL,
     LANDMARK,
     LOOPCLOSE,
-    MAP_GRAPH,
     ODOM,
     PRIOR,
     REJECTED,
@@ -33,8 +32,6 @@ from pose_graphs import (
 )
 from records import information_of, read
 from worlds import between
-
-import l1slam_ros as l1
 
 
 @pytest.fixture
@@ -152,9 +149,3 @@ def test_a_key_beyond_63_bits_is_one_line(capsys, tmp_path, truth, keys):
     out, _ = run(capsys, 'info', tmp_path / 'bag', '--odom-topic', '/pose_graph', code=3)
     assert 'poses       6 in SE2, ids 1 to 6' in out
     assert f'an edge of keyframe {max(keys)}; expected numbers up to 2^63 - 1' in out
-
-
-def test_who_has_no_odometry_is_told_of_the_graph(bag):
-    said = f'0 keyframes from /none; .*{MAP_GRAPH} is on /rtabmap'
-    with pytest.raises(l1.L1SlamError, match=said):
-        l1.read_graph(bag, odom_topic='/none')

@@ -10,33 +10,15 @@
 
 import pytest
 from command import run
-from mcap.writer import Writer as McapWriter
 from records import error_of
-from rosbags.rosbag2 import StoragePlugin, Writer
 from worlds import simulated_bag
 
 import l1slam_ros as l1
-from bags import STRING, TYPES
 
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     return simulated_bag(tmp_path_factory.mktemp('world') / 'bag', 5, 5)
-
-
-def test_an_empty_bag(capsys, tmp_path):
-    with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        writer.add_connection('/a', STRING, typestore=TYPES)
-    with (tmp_path / 'a.mcap').open('wb') as stream:
-        writer = McapWriter(stream)
-        writer.start('ros2')
-        writer.register_channel('/a', 'cdr', writer.register_schema(STRING, 'ros2msg', b''))
-        writer.finish()
-    for path in tmp_path / 'bag', tmp_path / 'a.mcap':
-        out, err = run(capsys, 'info', path, code=2)
-        assert 'duration    0.0 s from 0.000000000\nnote        none of l1slam' in out
-        assert f'topic       /a: 0 of {STRING}\n' in out
-        assert err == f'l1slam: {path}: 0 keyframes from /odom; expected 2 or more\n'
 
 
 def test_what_is_no_bag_is_told(capsys, tmp_path, bag):
