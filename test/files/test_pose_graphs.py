@@ -71,14 +71,6 @@ def test_only_what_was_measured_between_two_keyframes_is_a_loop(tmp_path, truth)
     assert record.graph.between.is_odometry.all() and record.skipped == ()
 
 
-def test_who_listens_late_knows_the_time_of_the_newest_alone(tmp_path, truth):
-    last = growing(truth, [link(6, 1, GLOBAL, truth)])[-1]
-    record = read(write(tmp_path / 'bag', [*driven(truth), ('/graph', 15, last)]),
-                  loop_topic='/graph')
-    assert record.graph.between.is_odometry.all()
-    assert record.skipped[0].startswith('1 message refused: a loop of keyframe 1, whose stamp no')
-
-
 def test_a_front_end_that_begins_anew_has_its_numbers_again(tmp_path, truth):
     """A keyframe of unknown time is never given that of another with its number."""
     late = growing(truth, [])[-1]
@@ -139,13 +131,13 @@ def test_from_a_bag_come_the_loops_or_the_whole_graph(bag, truth, topic):
     assert np.allclose(sigma, SIGMA[[0, 1, 5]])
 
 
-@pytest.mark.parametrize('keys', [(6, 2**63), (2**64 - 1, 2**63)])
-def test_a_key_beyond_63_bits_is_one_line(capsys, tmp_path, truth, keys):
-    truth = {k - 1: pose for k, pose in enumerate(truth, 1)} | {
-        key - 1: truth[0] for key in keys[-1:] + keys[:1] if key > 6}
-    message = pose_graph(20, [(k, 9.0) for k in (*range(1, 7), *keys)], [
-        *(edge(k, k + 1, ODOM, truth) for k in range(1, 6)), edge(*keys, LOOPCLOSE, truth)])
+@pytest.mark.parametrize('key', [2**63, 2**64 - 1])
+def test_a_key_beyond_63_bits_is_one_line(capsys, tmp_path, truth, key):
+    beyond = edge(6, 1, LOOPCLOSE, truth)
+    beyond.key_to = key
+    message = pose_graph(20, [(k, 9.0) for k in (*range(1, 7), key)], [
+        *(edge(k, k + 1, ODOM, truth) for k in range(1, 6)), beyond])
     write(tmp_path / 'bag', [('/pose_graph', 1, message)])
     out, _ = run(capsys, 'info', tmp_path / 'bag', '--odom-topic', '/pose_graph', code=3)
     assert 'poses       6 in SE2, ids 1 to 6' in out
-    assert f'an edge of keyframe {max(keys)}; expected numbers up to 2^63 - 1' in out
+    assert f'an edge of keyframe {key}; expected numbers up to 2^63 - 1' in out

@@ -125,11 +125,6 @@ def test_standard_types_need_no_definition(tmp_path, capsys, plain, recording):
     assert solved(capsys, tmp_path, sqlite)[:2] == plain[:2]
 
 
-def reference(message):
-    """Return the earlier time of a loop [s]."""
-    return float(message.header.frame_id.rpartition('@')[2])
-
-
 def changed(recording, seconds=0, child=None):
     """Return messages that came so much later, also the times among them that loops name."""
     found, begin = [], recording[0][2] / 1e9
@@ -138,7 +133,7 @@ def changed(recording, seconds=0, child=None):
         message.header.stamp.sec += seconds
         if topic == '/odom':
             message.child_frame_id = child or message.child_frame_id
-        elif (earlier := reference(message)) >= begin:
+        elif (earlier := float(message.header.frame_id.rpartition('@')[2])) >= begin:
             message.header.frame_id = f'base_link@{earlier + seconds:.9f}'
         found.append((topic, msgtype, time + seconds * 10**9,
                       bytes(TYPES.serialize_cdr(message, msgtype))))
@@ -169,14 +164,8 @@ def test_a_loop_says_after_any_pause_that_a_bag_is_of_the_drive(tmp_path, capsys
 @pytest.mark.parametrize('change', [
     {'child': 'another'}, {'seconds': 24 * 3600}, {'seconds': -5}], ids=str)
 def test_bags_of_other_drives_stay_apart(tmp_path, capsys, recording, change):
-    begin = by_number(recording, 2)[1][0][2] / 1e9
-    own = [m for m in recording if m[0] == '/odom' or m[2] / 1e9 < begin or reference(
-        TYPES.deserialize_cdr(m[3], m[1])) > begin]
-    border = sum(m[2] / 1e9 < begin for m in own)
-    first, second = (rosbag2_directory(tmp_path / name, messages, MCAP, note=NOTE)
-                     for name, messages in (('first', own[:border]),
-                                            ('second', changed(own[border:], **change))))
-    main(['merge', str(first), str(second), '--output', str(tmp_path / 'out.g2o')])
-    said = capsys.readouterr().err
+    own = [message for message in recording if message[0] == '/odom']
+    first, second = halves(tmp_path, own, **change)
+    said = run(capsys, 'merge', first, second, '--output', tmp_path / 'out.g2o', code=None)[1]
     assert 'one drive' not in said
     assert f'{second}: nothing that is believed joins it to {first}' in said
