@@ -81,7 +81,7 @@ def read_part(recording, whole):
 
     These must be the first ones of the recording, but for so many of the last.
     """
-    def used(path, but=0, recording=recording, whole=whole):
+    def used(path, but=0):
         record = read(path)
         said, count = damage_in(record.skipped), len(recording)
         if said:
@@ -175,9 +175,8 @@ def test_of_a_chunk_cut_in_two_the_first_part_is_used(tmp_path, read_part, recor
     assert_told(said, path, found)
 
 
-def test_wherever_a_bit_of_our_bag_is_wrong_no_message_is(tmp_path, read_part, rng):
-    bag = simulated_bag(tmp_path / 'bag', 140, 210)
-    recording, of_bag = recording_of(bag), factors_of(l1.read_graph(bag)[0])
+def test_wherever_a_bit_of_our_bag_is_wrong_no_message_is(
+        tmp_path, read_part, bag, recording, rng):
     whole = (bag / 'bag.mcap').read_bytes()
     path = tmp_path / 'a.mcap'
     told = 0
@@ -186,7 +185,7 @@ def test_wherever_a_bit_of_our_bag_is_wrong_no_message_is(tmp_path, read_part, r
         damaged[at] ^= 1 << rng.integers(8)
         path.write_bytes(damaged)
         with suppress(l1.L1SlamError):
-            found, said = read_part(path, recording=recording, whole=of_bag)
+            found, said = read_part(path)
             assert said or found == len(recording)
             told += bool(said)
     assert told > 6
