@@ -285,6 +285,32 @@ def test_a_message_that_cannot_be_decoded_is_left_out(tmp_path, recording):
         f'{path} is damaged: 2 messages cannot be decoded; 299 others were used')
 
 
+def test_what_is_no_bag_is_told(capsys, tmp_path, bag):
+    (tmp_path / 'a.txt').write_text('x')
+    (tmp_path / 'empty').mkdir()
+    (tmp_path / 'two').mkdir()
+    for name in 'a_0.mcap', 'b_0.mcap':
+        (tmp_path / 'two' / name).write_bytes((bag / 'bag.mcap').read_bytes())
+
+    for name, said in (('none', ': no such file or directory; expected a'),
+                       ('a.txt', 'unknown kind of file; expected .g2o, '),
+                       ('empty', 'without metadata.yaml and with the files of 0 bags'),
+                       ('two', 'without metadata.yaml and with the files of 2 bags')):
+        assert said in error_of(l1.read_graph, tmp_path / name)
+        found = run(capsys, 'info', tmp_path / name, code=2)[1]
+        assert said in found and found.count('\n') == 1
+
+
+@pytest.mark.parametrize('content', [b'', b'x', b'\x89MCAP0\r\n', b'\x00' * 5000])
+@pytest.mark.parametrize('suffix', ['.mcap', '.db3'])
+def test_a_file_that_is_no_bag(capsys, tmp_path, content, suffix):
+    path = tmp_path / f'a{suffix}'
+    path.write_bytes(content)
+    assert error_of(l1.read_graph, path).startswith(f'{path}: damaged, or not a bag (')
+    said = run(capsys, 'info', path, code=2)[1]
+    assert said.startswith(f'l1slam: {path}: damaged, or not a bag (') and said.count('\n') == 1
+
+
 def test_a_ros1_bag_that_is_damaged_is_refused(tmp_path, capsys, recording):
     path = ros1_file(tmp_path / 'a.bag', recording)
     whole = path.read_bytes()
