@@ -110,15 +110,6 @@ def test_the_same_square_in_toro(write):
     assert_same(a, b)
 
 
-@pytest.mark.parametrize(('line', 'message'), [
-    ('EDGE_SE2 3 7 1 0 0 -2 1 0 -3 0 -1',
-     'information [-2 1 0 1 -3 0 0 0 -1]; expected a positive definite matrix'),
-    ('EDGE_PRIOR_SE2 3 1 0 0 -1 0 0 -1 0 -1', 'information [-1 0 0 0 -1 0 0 0 -1]; expected'),
-])
-def test_an_edge_that_cannot_be_used_is_told(write, line, message):
-    assert message_of(write(SQUARE + line + '\n')).startswith(f':9: {message}')
-
-
 @pytest.mark.parametrize(('line', 'least', 'expected'), [
     ('EDGE_SE2 3 7 1 0 0 1 2 0 1 0 1', '-0.33',
      [[1.5, 1.5, 0], [1.5, 1.5, 0], [0, 0, 1]]),
