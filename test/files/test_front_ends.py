@@ -12,10 +12,13 @@ import numpy as np
 import pytest
 from front_ends import (
     BARE,
+    EDGE,
     FORK,
+    NEW_NODE,
     POSE,
     POSE2D,
     WITHIN,
+    Recording,
     swarm_bag,
     toolbox_bag,
 )
@@ -75,6 +78,24 @@ def test_slam_toolboxs_loops_have_the_times_of_its_nodes(tmp_path, world, defini
     assert record.graph.between.is_odometry.all()
     assert record.skipped[0].startswith(f'{len(pairs)} messages refused: a loop of keyframe ')
     assert 'whose stamp no message has given; expected a known keyframe' in record.skipped[0]
+
+
+def test_a_slam_toolbox_that_begins_anew_has_a_graph_of_its_own(tmp_path):
+    bag = Recording(tmp_path / 'bag', POSE2D)
+    step = bag.new('geometry_msgs/msg/Pose2D', x=1.0, y=0.0, theta=0.0)
+    with bag.writer:
+        for start in 10, 50:
+            for source, node, later in (0, 0, 0), (0, 1, 1), (1, 2, 2), (2, 3, 3), (3, 0, 3.5):
+                if later == node:
+                    bag.write('/odom', start + node, bag.odometry(start + node, (node, 0.0, 0.0)))
+                edge = bag.new(EDGE, source_id=source, target_id=node, relative_pose=step,
+                               covariance=np.eye(3).ravel())
+                bag.write('/events', start + later, bag.new(
+                    NEW_NODE, new_node_id=node, stamp=bag.time(start + node),
+                    pose=bag.pose(np.zeros(3)), edge=edge))
+    record = read(tmp_path / 'bag', loop_topic='/events')
+    loops = record.graph.between.pairs[~record.graph.between.is_odometry]
+    assert sorted((record.stamps[loops] // 10**9).tolist()) == [[10, 13], [50, 53]]
 
 
 @pytest.mark.parametrize('definitions', [BARE, FORK], ids=['transform', 'covariance'])
