@@ -55,13 +55,6 @@ def test_a_small_graph(write):
     assert record.skipped == ()
 
 
-def test_edges_alone_name_the_vertices(write):
-    record = read(write('EDGE_SE2 5 -2 1 0 0 1 0 0 1 0 1\n'))
-    assert record.ids.tolist() == [-2, 5]
-    assert record.poses is None
-    assert record.graph.between.i.tolist() == [1]
-
-
 def test_priors_are_seen_from_the_world(write, tmp_path):
     record = read(write(
         'EDGE_PRIOR_SE2 7 1 2 0.5 10 1 2 20 3 30\n' + SQUARE + 'EDGE_PRIOR_SE2_XY 9 3 4 5 1 6\n'
