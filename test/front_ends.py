@@ -6,10 +6,11 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of slam_toolbox and of Swarm-SLAM, written by rosbags alone."""
+"""Recordings with the messages of other front ends, written by rosbags alone."""
 
 import numpy as np
-from messages import odometry
+from heard import pose3
+from messages import header, odometry, pose
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -44,24 +45,46 @@ FORK = {KEYFRAME: BARE[KEYFRAME] + 'bool tracking_reset\n', **{
     for name in (WITHIN, BETWEEN)}}
 
 
-def pose3(pose):
-    """Return x y z and the quaternion x y z w of a pose in the plane."""
-    x, y, heading = np.array(pose).tolist()
-    return x, y, 0.0, 0.0, 0.0, np.sin(heading / 2), np.cos(heading / 2)
+class Messages:
+    """Messages of ROS and of some definitions more, by rosbags alone."""
 
-
-class Recording:
-    """A bag under way, written by rosbags alone."""
-
-    def __init__(self, path, definitions):
+    def __init__(self, definitions):
         self.types = get_typestore(Stores.ROS2_JAZZY)
         self.types.register({name: fields for key, text in definitions.items()
                              for name, fields in get_types_from_msg(text, key).items()})
-        self.path, self._connections = path, {}
-        self.writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
 
     def new(self, name, **fields):
         return self.types.types[name](**fields)
+
+    def time(self, seconds):
+        return self.header(seconds).stamp
+
+    def header(self, seconds):
+        sec, part = divmod(float(seconds), 1)
+        return header(self.new, int(sec), round(part * SECOND), 'map')
+
+    def pose(self, at):
+        numbers = pose3(at)
+        return pose(self.new, numbers[:3], numbers[3:])
+
+    def transform(self, at):
+        there = self.pose(at)
+        return self.new('geometry_msgs/msg/Transform', rotation=there.orientation,
+                        translation=self.new('geometry_msgs/msg/Vector3', **vars(there.position)))
+
+    def odometry(self, seconds, at):
+        numbers = pose3(at)
+        return odometry(self.new, self.header(seconds), position=numbers[:3],
+                        quaternion=numbers[3:], covariance=np.zeros(36))
+
+
+class Recording(Messages):
+    """A bag under way, written by rosbags alone."""
+
+    def __init__(self, path, definitions):
+        super().__init__(definitions)
+        self._connections = {}
+        self.writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
 
     def write(self, topic, seconds, message):
         if topic not in self._connections:
@@ -69,28 +92,6 @@ class Recording:
                 topic, message.__msgtype__, typestore=self.types)
         self.writer.write(self._connections[topic], round(seconds * SECOND),
                           self.types.serialize_cdr(message, message.__msgtype__))
-
-    def time(self, seconds):
-        return self.new('builtin_interfaces/msg/Time', sec=int(seconds), nanosec=0)
-
-    def header(self, seconds):
-        return self.new('std_msgs/msg/Header', stamp=self.time(seconds), frame_id='map')
-
-    def pose(self, pose, name='Pose', position='position', rotation='orientation',
-             vector='Point'):
-        x, y, z, *q = pose3(pose)
-        turn = dict(zip('xyzw', q, strict=True))
-        return self.new(f'geometry_msgs/msg/{name}', **{
-            position: self.new(f'geometry_msgs/msg/{vector}', x=x, y=y, z=z),
-            rotation: self.new('geometry_msgs/msg/Quaternion', **turn)})
-
-    def transform(self, pose):
-        return self.pose(pose, 'Transform', 'translation', 'rotation', 'Vector3')
-
-    def odometry(self, seconds, pose):
-        x, y, z, *q = pose3(pose)
-        return odometry(self.new, self.header(seconds), position=(x, y, z), quaternion=q,
-                        covariance=np.zeros(36))
 
 
 def edge_message(bag, factors, row):
@@ -108,7 +109,7 @@ def edge_message(bag, factors, row):
                    covariance=covariance.ravel())
 
 
-def toolbox_bag(path, graph, definitions, rng, odometry=None, events=True):
+def toolbox_bag(path, graph, definitions, odometry=None, events=True):
     """
     A recording of slam_toolbox: an event a node, its whole graph now and then, nodes moving.
 
@@ -116,8 +117,9 @@ def toolbox_bag(path, graph, definitions, rng, odometry=None, events=True):
     """
     bag, factors = Recording(path, definitions), graph.between
     edges = [edge_message(bag, factors, row) for row in range(len(factors))]
-    nothing = bag.new(EDGE, source_id=0, target_id=0, covariance=np.zeros(9), relative_pose=type(
-        edges[0].relative_pose)(**vars(edges[0].relative_pose)))
+    nothing = bag.new(EDGE, source_id=0, target_id=0, covariance=np.zeros(9),
+                      relative_pose=edges[0].relative_pose)
+    rng = np.random.default_rng(1)
     with bag.writer:
         for k in range(graph.n_poses):
             seconds = 100 + k

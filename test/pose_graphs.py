@@ -9,10 +9,8 @@
 """Messages with the pose graphs of RTAB-Map and of pose_graph_tools, and bags of them."""
 
 import numpy as np
-from front_ends import pose3
-from messages import odometry, of_rosbags
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from front_ends import Messages, Recording
+from worlds import between
 
 SECOND = 10**9
 MAP_GRAPH, POSE_GRAPH = 'rtabmap_msgs/msg/MapGraph', 'pose_graph_tools_msgs/msg/PoseGraph'
@@ -29,11 +27,7 @@ DEFINITIONS = {
         'geometry_msgs/Pose pose\nfloat64[36] covariance\n',
     POSE_GRAPH: 'std_msgs/Header header\nPoseGraphNode[] nodes\nPoseGraphEdge[] edges\n',
 }
-FIELDS = {name: fields for key, text in DEFINITIONS.items()
-          for name, fields in get_types_from_msg(text, key).items()}
-TYPES = get_typestore(Stores.ROS2_JAZZY)
-TYPES.register(FIELDS)
-M = TYPES.types
+M = Messages(DEFINITIONS)
 NEIGHBOUR = 0
 GLOBAL = 1
 VIRTUAL = 5
@@ -46,56 +40,33 @@ SIGMA = np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03])
 COVARIANCE = np.diag(SIGMA**2)
 
 
-def between(a, b):
-    """Return poses (m, 3) seen from others."""
-    c, s, d = np.cos(a[:, 2]), np.sin(a[:, 2]), b - a
-    turn = (d[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    return np.stack((c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], turn), axis=1)
-
-
-def header(seconds):
-    stamp = M['builtin_interfaces/msg/Time'](int(seconds), round(seconds % 1 * SECOND))
-    return M['std_msgs/msg/Header'](stamp, 'map')
-
-
-def parts(pose):
-    """Return position and orientation of a pose (1, 3) in the plane."""
-    numbers = pose3(pose[0])
-    return numbers[:3], M['geometry_msgs/msg/Quaternion'](*numbers[3:])
-
-
-def pose_message(pose):
-    position, orientation = parts(pose)
-    return M['geometry_msgs/msg/Pose'](M['geometry_msgs/msg/Point'](*position), orientation)
-
-
-def transform(pose):
-    position, orientation = parts(pose)
-    return M['geometry_msgs/msg/Transform'](
-        M['geometry_msgs/msg/Vector3'](*position), orientation)
+def seen(truth, i, j):
+    """Return the pose (3,) of keyframe j seen from i, numbers from 1."""
+    return between(truth[i - 1], truth[j - 1])
 
 
 def link(i, j, kind, truth, covariance=COVARIANCE):
-    return M['rtabmap_msgs/msg/Link'](
-        i, j, kind, transform(between(truth[i - 1][None], truth[j - 1][None])),
-        np.linalg.inv(covariance).ravel())
+    return M.new('rtabmap_msgs/msg/Link', from_id=i, to_id=j, type=kind,
+                 transform=M.transform(seen(truth, i, j)),
+                 information=np.linalg.inv(covariance).ravel())
 
 
 def map_graph(seconds, ids, links):
-    return M[MAP_GRAPH](header(seconds), transform(np.zeros((1, 3))), np.array(ids, np.int32),
-                        [pose_message(np.zeros((1, 3)))] * len(ids), links)
+    origin = np.zeros(3)
+    return M.new(MAP_GRAPH, header=M.header(seconds), map_to_odom=M.transform(origin),
+                 poses_id=np.array(ids, np.int32), poses=[M.pose(origin)] * len(ids), links=links)
 
 
 def edge(i, j, kind, truth, covariance=COVARIANCE, robots=(0, 0)):
-    return M['pose_graph_tools_msgs/msg/PoseGraphEdge'](
-        header(0), i, j, *robots, kind,
-        pose_message(between(truth[i - 1][None], truth[j - 1][None])), covariance.ravel())
+    return M.new('pose_graph_tools_msgs/msg/PoseGraphEdge', header=M.header(0), key_from=i,
+                 key_to=j, robot_from=robots[0], robot_to=robots[1], type=kind,
+                 pose=M.pose(seen(truth, i, j)), covariance=covariance.ravel())
 
 
 def pose_graph(seconds, keys, edges, robot=0):
-    nodes = [M['pose_graph_tools_msgs/msg/PoseGraphNode'](
-        header(time), robot, key, pose_message(np.zeros((1, 3)))) for key, time in keys]
-    return M[POSE_GRAPH](header(seconds), nodes, edges)
+    nodes = [M.new('pose_graph_tools_msgs/msg/PoseGraphNode', header=M.header(time),
+                   robot_id=robot, key=key, pose=M.pose(np.zeros(3))) for key, time in keys]
+    return M.new(POSE_GRAPH, header=M.header(seconds), nodes=nodes, edges=edges)
 
 
 def growing(truth, closing):
@@ -109,21 +80,14 @@ def growing(truth, closing):
 
 def write(path, messages):
     """Write (topic, seconds, message) as a bag by rosbags; return the path."""
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topics = {}
-        for topic, seconds, message in messages:
-            kind = message.__msgtype__
-            if topic not in topics:
-                topics[topic] = writer.add_connection(topic, kind, typestore=TYPES)
-            writer.write(topics[topic], round(seconds * SECOND),
-                         TYPES.serialize_cdr(message, kind))
+    bag = Recording(path, DEFINITIONS)
+    with bag.writer:
+        for message in messages:
+            bag.write(*message)
     return path
 
 
 def driven(truth, first=10.0):
     """Yield the odometry of a robot whose keyframe k + 1 is of 10 + k s, as (n, 3) has it."""
-    for k in range(len(truth)):
-        numbers = pose3(between(truth[:1], truth[k : k + 1])[0])
-        yield '/odom', first + k, odometry(
-            of_rosbags, header(first + k), position=numbers[:3], quaternion=numbers[3:],
-            covariance=np.zeros(36))
+    for k, pose in enumerate(truth):
+        yield '/odom', first + k, M.odometry(first + k, between(truth[0], pose))

@@ -13,6 +13,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from records import information_of, read
 from scipy.spatial.transform import Rotation
+from worlds import write_g2o
 
 import l1slam_ros as l1
 
@@ -38,19 +39,6 @@ def write(tmp_path):
         path.write_text(content)
         return path
     return file
-
-
-def random_text(rng, n=8):
-    """Return a graph in a row, its poses, measurements and information anywhere."""
-    A = rng.normal(size=(n - 1, 6, 6))
-    information = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(6)
-    poses, measured = rng.normal(size=(n, 7)), rng.normal(size=(n - 1, 7))
-    for of in poses, measured:
-        of[:, 3:] /= np.linalg.norm(of[:, 3:], axis=1, keepdims=True)
-    lines = [('VERTEX_SE3:QUAT', 10 + k, *poses[k].tolist()) for k in range(n)]
-    lines += [('EDGE_SE3:QUAT', 10 + k, 11 + k, *measured[k].tolist(),
-               *information[k][np.triu_indices(6)].tolist()) for k in range(n - 1)]
-    return '\n'.join(' '.join(map(str, line)) for line in lines)
 
 
 def test_a_small_graph(write):
@@ -80,11 +68,16 @@ def test_angles_of_toro_are_turns_about_z_then_y_then_x(write):
 
 
 @pytest.mark.parametrize('reading', ['quaternion', 'angle'])
-def test_round_trip(write, tmp_path, rng, reading):
-    record = read(write(random_text(rng)), rotation_information=reading)
-    record.write(tmp_path / 'b.g2o', rotation_information=reading)
+def test_round_trip(tmp_path, rng, reading):
+    A, measured = rng.normal(size=(7, 6, 6)), rng.normal(size=(7, 7))
+    measured[:, 3:] /= np.linalg.norm(measured[:, 3:], axis=1, keepdims=True)
+    source = write_g2o(tmp_path / 'a.g2o', [(k, k + 1) for k in range(7)], measured,
+                       A @ A.transpose(0, 2, 1) + 0.1 * np.eye(6))
+    record = read(source, rotation_information=reading)
+    poses = record.graph.between.measurement[[*range(7), 0]]
+    record.write(tmp_path / 'b.g2o', poses, rotation_information=reading)
     back = read(tmp_path / 'b.g2o', rotation_information=reading)
-    assert_array_equal(record.poses, back.poses)
+    assert_array_equal(poses, back.poses)
     assert_array_equal(record.graph.between.measurement, back.graph.between.measurement)
     assert_allclose(information_of(record.graph), information_of(back.graph), atol=1e-12)
 
@@ -98,21 +91,29 @@ def test_a_quaternion_that_is_none_is_named(write, turn):
 
 ABSOLUTE = f"""\
 PARAMS_SE3OFFSET 4 0 0 0 0 0 0 1
+VERTEX_PLANE 20 0 0 1 0
+EDGE_SE3_PLANE 7 20 0 0 1 0.5 10 0 0 10 0 10
 EDGE_SE3_PRIOR 7 4 1 2 3 0 0 0.6 0.8 {UNIT}
 EDGE_SE3_XYZPRIOR 3 4 1 2 3 10 0 0 10 0 30
+EDGE_SE3_PRIORXYZ 3 1 2 4 10 0 0 10 0 30
+EDGE_SE3_PRIORXY 7 4 5 20 0 20
 """
 
 
-def test_absolute_poses(write, tmp_path):
+def test_absolute_poses_and_the_position_fixes_of_hdl_graph_slam(write, tmp_path):
+    """Those without a height say nothing of it; the floor it saw is no part of a pose graph."""
     record = read(write(SQUARE + ABSOLUTE))
+    sentence, = record.skipped
+    assert "1 'VERTEX_PLANE', 1 'EDGE_SE3_PLANE'" in sentence
     for _ in range(2):
         factors = record.graph.between
-        assert record.skipped == ()
-        assert factors.i.tolist() == [0, -1, -1] and factors.j.tolist() == [1, 1, 0]
-        assert_allclose(factors.measurement[1:], [[1, 2, 3, 0, 0, 0.6, 0.8],
-                                                  [1, 2, 3, 0, 0, 0, 1]])
+        assert factors.i.tolist() == [0, *[-1] * 4] and factors.j.tolist() == [1, 1, 0, 0, 1]
+        assert_allclose(factors.measurement[1:3], [[1, 2, 3, 0, 0, 0.6, 0.8],
+                                                   [1, 2, 3, 0, 0, 0, 1]])
+        assert_allclose(factors.measurement[3:, :3], [[1, 2, 4], [4, 5, 0]])
         assert_allclose([np.diag(one) for one in information_of(record.graph)[1:]],
-                        [[1, 1, 1, 0.25, 0.25, 0.25], [10, 10, 30, 0, 0, 0]])
+                        [[1, 1, 1, 0.25, 0.25, 0.25], *[[10, 10, 30, 0, 0, 0]] * 2,
+                         [20, 20, 0, 0, 0, 0]])
         record.write(tmp_path / 'b.g2o')
         record = read(tmp_path / 'b.g2o')
     assert (tmp_path / 'b.g2o').read_text().count('PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1') == 1
@@ -120,31 +121,8 @@ def test_absolute_poses(write, tmp_path):
 
 def test_what_was_measured_elsewhere_than_at_the_robot_is_named(write):
     beside = ABSOLUTE.replace('4 0 0 0', '4 0 0.5 0')
-    with pytest.raises(l1.L1SlamError, match=r'a\.g2o:6: EDGE_SE3_PRIOR: the pose is that of'):
+    with pytest.raises(l1.L1SlamError, match=r'a\.g2o:8: EDGE_SE3_PRIOR: the pose is that of'):
         l1.read_graph(write(SQUARE + beside))
-
-
-FIXES = """\
-VERTEX_PLANE 20 0 0 1 0
-EDGE_SE3_PLANE 7 20 0 0 1 0.5 10 0 0 10 0 10
-EDGE_SE3_PRIORXYZ 3 1 2 3 10 0 0 10 0 30
-EDGE_SE3_PRIORXY 7 4 5 20 0 20
-"""
-
-
-def test_position_fixes_of_hdl_graph_slam(write, tmp_path):
-    """Those without a height say nothing of it; the floor it saw is no part of a pose graph."""
-    record = read(write(SQUARE + FIXES))
-    sentence, = record.skipped
-    assert "1 'VERTEX_PLANE', 1 'EDGE_SE3_PLANE'" in sentence
-    for _ in range(2):
-        factors = record.graph.between
-        assert factors.i.tolist() == [0, -1, -1] and factors.j.tolist() == [1, 0, 1]
-        assert_allclose(factors.measurement[1:, :3], [[1, 2, 3], [4, 5, 0]])
-        assert_allclose([np.diag(one) for one in information_of(record.graph)[1:]],
-                        [[10, 10, 30, 0, 0, 0], [20, 20, 0, 0, 0, 0]])
-        record.write(tmp_path / 'b.g2o')
-        record = read(tmp_path / 'b.g2o')
 
 
 def test_loops_that_could_be_switched_off_are_loops(write):

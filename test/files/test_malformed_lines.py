@@ -6,12 +6,18 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Each malformed line of a graph file is named, found and expected beside it, in any format."""
+"""
+Each malformed line of a graph file is named, found and expected beside it, in any format.
+
+Numbers are the same whether or not all lines end alike, as where one matrix serves.
+"""
 
 import re
 from typing import NamedTuple
 
+import numpy as np
 import pytest
+from records import information_of, read
 
 import l1slam_ros as l1
 
@@ -51,7 +57,7 @@ SOUND = ['V 7 POSE', 'V 3 POSE', 'E 3 7 POSE INFO', 'V 9 POSE', 'E 7 9 POSE INFO
     ('E 3 7.5 POSE INFO', "E: '7.5' is not a whole number of 64 bits"),
     ('E 3 7 inf TAIL INFO', "E: 'inf' is not a finite number; expected"),
     ('E 3 7 -1e99 TAIL INFO', "E: '-1e99' is beyond 1e+30; expected"),
-    ('E 3 7 POSE NONE', 'information [0 0 0'),
+    ('E 3 7 POSE NONE', 'information [0 0 0'), ('E 3 7 POSE MINUS', 'information [-1 0 0 0'),
     ('E 3 8 POSE INFO', 'vertex 8 is unknown; expected one of the 3 vertices'),
     ('E 100 3 POSE INFO', 'vertex 100 is unknown; expected one of the 3 vertices'),
     ('V 7 POSE', 'vertex 7 comes twice, first at line 1; expected each once'),
@@ -62,11 +68,12 @@ SOUND = ['V 7 POSE', 'V 3 POSE', 'E 3 7 POSE INFO', 'V 9 POSE', 'E 7 9 POSE INFO
 def test_each_malformed_line_is_named(tmp_path, name, line, message):
     of, path = FORMATS[name], tmp_path / 'a.g2o'
     words = {'V': of.vertex, 'E': of.edge, 'POSE': of.pose, 'TAIL': of.pose[2:],
-             'INFO': of.information, 'NONE': of.information.replace('1', '0'), 'OTHER': of.other}
+             'INFO': of.information, 'NONE': of.information.replace('1', '0'),
+             'MINUS': of.information.replace('1', '-1'), 'OTHER': of.other}
     pose, edge = len(of.pose.split()), len((of.pose + ' ' + of.information).split())
 
     def written(text):
-        return re.sub(r'\b(V|E|POSE|TAIL|INFO|NONE|OTHER)\b', lambda word: words[word[0]], text)
+        return re.sub('|'.join(rf'\b{word}\b' for word in words), lambda of: words[of[0]], text)
 
     # A good line follows: it is not the last one that is named, nor the first of its tag.
     path.write_text(written('\n'.join([*SOUND, line, 'E 9 3 POSE INFO\n'])))
@@ -75,3 +82,45 @@ def test_each_malformed_line_is_named(tmp_path, name, line, message):
     said = written(message).format(few=2 + pose, many=3 + edge, edge=edge, vertex=pose,
                                    beside=2 if 'space' in name else 3)
     assert str(caught.value).startswith(f'{path}:6: {said}') and '\n' not in str(caught.value)
+
+
+# What edges measure but for x, and their information.
+END = '0 0 400 0 0 400 0.0 1e4'
+ALIKE = [f'1 2 0.1 {END}', f'2 3 .2 {END}', f'3 4 -5 {END}']
+
+
+@pytest.fixture
+def parsed(tmp_path):
+    """Return a function from edges to the ids of their keyframes, measurements, information."""
+    def read_edges(texts):
+        path = tmp_path / 'a.g2o'
+        path.write_text(''.join(f'EDGE_SE2 {text}\n' for text in texts))
+        record = read(path)
+        factors = record.graph.between
+        return record.ids[factors.pairs], factors.measurement, information_of(record.graph)
+    return read_edges
+
+
+@pytest.mark.parametrize('texts', [
+    ALIKE, [text.replace(' ', '  ') for text in ALIKE], ALIKE[:1],
+    [f'{text} # ours' for text in ALIKE],
+    [ALIKE[0], '2 3 .2 0 0 +400 0 0 400 0 1e4', ALIKE[2]]])
+def test_lines_that_end_alike_read_as_any_others(parsed, texts):
+    ids, measured, information = parsed(texts)
+    assert ids.tolist() == [[1, 2], [2, 3], [3, 4]][:len(texts)]
+    assert np.array_equal(measured, [[x, 0, 0] for x in (0.1, 0.2, -5)][:len(texts)])
+    np.testing.assert_allclose(information, [np.diag([400, 400, 1e4])] * len(texts), rtol=1e-15)
+
+
+@pytest.mark.parametrize(('middle', 'found'), [
+    (f'2 3 # .2 {END}', '2 fields'), (f'2 3 x {END}', "'x' is not a finite number"),
+    (f'2 3.5 .2 {END}', "'3.5' is not a whole"), (f'2 3 .2 1{END}x', "'1e4x'"), (END, '8 fields')])
+def test_the_first_malformed_line_among_lines_that_end_alike_is_named(parsed, middle, found):
+    with pytest.raises(l1.L1SlamError, match=f'a.g2o:2: EDGE_SE2: {found}'):
+        parsed([ALIKE[0], middle, ALIKE[2], middle])
+
+
+@pytest.mark.parametrize('end', ['nan', 'inf', '1e31', '0x1'])
+def test_what_all_lines_end_in_is_judged_too(parsed, end):
+    with pytest.raises(l1.L1SlamError, match=f'a.g2o:1: EDGE_SE2: {end!r}'):
+        parsed([f'{k} 2 .1 0 0 400 0 0 400 0.0 {end}' for k in range(3)])

@@ -96,11 +96,3 @@ def test_a_loop_names_its_times_to_the_nanosecond_and_states_its_covariance(tmp_
     np.testing.assert_allclose(record.graph.between.measurement[row], (4.5, 0.25, np.pi / 2))
     np.testing.assert_allclose(information_of(record.graph)[row], np.diag([25, 1 / 0.09, 100]),
                                atol=1e-12)
-
-
-@pytest.mark.parametrize('value', [math.nan, math.inf])
-def test_a_covariance_that_is_none_is_replaced(tmp_path, value):
-    good = graph_of(tmp_path, GOOD)
-    bad = graph_of(tmp_path, [driven(k, covariance=np.full(36, value)) for k in range(5)])
-    np.testing.assert_array_equal(bad.graph.between.sqrt_information,
-                                  good.graph.between.sqrt_information)

@@ -11,7 +11,7 @@
 import numpy as np
 import pytest
 from command import run
-from records import Converted, beside, read
+from records import Converted, beside
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from worlds import simulated_bag
@@ -63,40 +63,15 @@ def test_every_kind_is_the_same_recording(tmp_path, capsys, graph_of, world, kin
     assert f'duration    {(last - first) / 1e9:.1f} s from {first / 1e9:.9f}\n' in said
 
 
-@pytest.mark.parametrize('note', [
-    'a word', '[1, 2]', '{turned_loops: a -1 99999999999999999999, turned_steps: [3]}'])
-def test_a_note_that_says_nothing_is_none(tmp_path, graph_of, world, note):
-    path = rosbag2_directory(tmp_path / 'a', world[1], StoragePlugin.MCAP, note=note)
-    assert_same_graph(graph_of(path, every=True), world[2])
-
-
-def test_a_robot_without_our_note_goes_by_the_defaults_of_the_node(tmp_path, world):
-    # 16 messages a metre and 20 a second, straight on; no word on their errors.
-    template = TYPES.deserialize_cdr(world[1][0][3], ODOMETRY)
-    assert not template.pose.covariance.any()
-    recording = []
-    for k in range(161):
-        template.header.stamp.nanosec, time = k % 20 * SECOND // 20, k * SECOND // 20
-        template.header.stamp.sec = 1 + k // 20
-        template.pose.pose.position.x = k / 16
-        recording.append(('/odom', ODOMETRY, time, bytes(TYPES.serialize_cdr(template, ODOMETRY))))
-    path = rosbag2_directory(tmp_path / 'a', recording, StoragePlugin.MCAP, note=None)
-    record, default = read(path), l1.BackendOptions()
-    assert np.diff(record.stamps).tolist() == [8 * SECOND // 20] * 20
-    steps = record.graph.between.measurement
-    np.testing.assert_allclose(steps, [[default.keyframe.translation, 0, 0]] * 20, atol=1e-12)
-    sigma = np.hypot(default.odometry.sigma_translation * 0.5, default.odometry.floor_translation)
-    np.testing.assert_allclose(record.graph.between.sqrt_information[:, 0, 0], 1 / sigma)
+def test_a_note_that_says_nothing_is_none(tmp_path, graph_of, world):
+    for k, note in enumerate(('a word', '{turned_loops: a -1 99999999999999999999}')):
+        path = rosbag2_directory(tmp_path / f'{k}', world[1], StoragePlugin.MCAP, note=note)
+        assert_same_graph(graph_of(path, every=True), world[2])
 
 
 def test_a_topic_of_another_type_is_told(tmp_path, world):
     names = {'/odom': '/loop_closures', '/loop_closures': '/odom'}
     swapped = [(names[topic], *rest) for topic, *rest in world[1]]
-    with pytest.raises(l1.L1SlamError) as caught:
-        l1.read_graph(world[0], loop_topic='/loops')
-    assert str(caught.value).endswith(
-        'no messages on /loops; expected geometry_msgs/msg/PoseWithCovarianceStamped; '
-        'geometry_msgs/msg/PoseWithCovarianceStamped is on /loop_closures')
     with pytest.raises(l1.L1SlamError, match=(
             '0 keyframes from /odom.* on /loop_closures; 181 messages refused: '
             'nav_msgs/msg/Odometry on /loop_closures; expected '
@@ -126,7 +101,7 @@ def test_loops_may_be_recorded_before_the_odometry_they_name(tmp_path, graph_of,
     odometry = [m for m in world[1] if m[0] == '/odom']
     record = graph_of(mcap_file(tmp_path / 'a.mcap', early + odometry), every=True)
     assert record.skipped == ()
-    assert len(record.graph.between) == len(read(world[0]).graph.between)
+    assert len(record.edges) == world[2][0].count(b'EDGE')
     # They come in order of time even from a file without order; of one time, in any.
     shuffled = [world[1][k] for k in rng.permutation(len(world[1]))]
     path = mcap_file(tmp_path / 'a.mcap', shuffled, use_chunking=False)
@@ -135,70 +110,17 @@ def test_loops_may_be_recorded_before_the_odometry_they_name(tmp_path, graph_of,
         sorted(one.splitlines()) for one in world[2]]
 
 
-def test_duplicates_and_a_clock_set_back_are_counted_and_told(tmp_path, graph_of, world):
-    recording = world[1]
-    odometry = [m for m in recording if m[0] == '/odom']
-    # The robot's driver starts anew: the messages of before come once more, later.
-    again = [(*m[:2], m[2] + 1000 * SECOND, m[3]) for m in odometry[:30]]
-    twice = sorted(recording + odometry[:10], key=lambda m: m[2])
-    path = mcap_file(tmp_path / 'a.mcap', twice + again)
-    record = graph_of(path, every=True)
-    first, last = odometry[0][2], odometry[-1][2]
-    assert record.skipped == (
-        f'10 messages refused: odometry stamp {first} ns is not after the last one, {first} ns',
-        f'odometry stamp {first} ns is not after the last one, {last} ns; a new part of the map '
-        'begins where the last one ends')
-    assert len(record.graph.between) == len(read(world[0]).graph.between) + len(again) - 1
-
-
-def changed(message, change):
-    topic, msgtype, time, data = message
-    decoded = TYPES.deserialize_cdr(data, msgtype)
-    change(decoded)
-    return topic, msgtype, time, bytes(TYPES.serialize_cdr(decoded, msgtype))
-
-
-def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, graph_of, world):
-    recording = list(world[1])
-
-    def broken(k, change):
-        recording[k] = changed(recording[k], change)
-
-    odometry = [k for k, m in enumerate(recording) if m[0] == '/odom']
-    loops = [k for k, m in enumerate(recording) if m[0] == '/loop_closures']
-    broken(odometry[50], lambda m: setattr(m.pose.pose.position, 'x', np.nan))
-    broken(odometry[60], lambda m: setattr(m.header.stamp, 'sec', 0))
-    broken(loops[3], lambda m: setattr(m.header, 'frame_id', 'map'))
-    broken(loops[4], lambda m: setattr(m.header.stamp, 'sec', 2_000_000))
-    record = graph_of(mcap_file(tmp_path / 'a.mcap', recording), every=True)
-    for said, start in zip(sorted(record.skipped), [
-            '1 loop not used: the odometry ends before its times',
-            "1 message refused: frame 'map' of a loop; expected base_link@",
-            '1 message refused: pose (nan, ', '1 message refused: stamp 0 s 0 ns; expected'],
-            strict=True):
-        assert said.startswith(start)
-    assert all('expected' in sentence for sentence in record.skipped if 'refused' in sentence)
-    assert record.graph.n_poses == 118
-
-
 def test_faults_of_the_odometry_are_told(tmp_path, graph_of, world):
-    """A jump, a stamp ahead, a restart, a variance of 1e12, and a last message on its own."""
-    def moved(x, sec, k, index=-1, variance=0.0):
-        def change(m):
-            m.pose.pose.position.x += x
-            m.header.stamp.sec += sec
-            m.pose.covariance = np.where(np.arange(36) == index, variance, m.pose.covariance)
-        recording[k] = changed(recording[k], change)
-
+    """A variance of 1e12, and a last message on its own."""
     recording = [m for m in world[1] if m[0] == '/odom']
-    moved(3e8, 0, 30)
-    moved(0.0, 5000, 40)
-    moved(0.0, 0, 50, 7, 1e12)
-    moved(0.0, 5000, len(recording) - 1)
+    for k, seconds, variance in (50, 0, 1e12), (-1, 5000, 0.0):
+        topic, kind, time, data = recording[k]
+        message = TYPES.deserialize_cdr(data, kind)
+        message.header.stamp.sec += seconds
+        message.pose.covariance = message.pose.covariance + variance * (np.arange(36) == 7)
+        recording[k] = topic, kind, time, bytes(TYPES.serialize_cdr(message, kind))
     record = graph_of(mcap_file(tmp_path / 'a.mcap', recording), every=True)
-    assert record.graph.n_poses == len(recording) - 3
-    jump, ahead, variance, last = record.skipped
-    assert jump.startswith('1 message refused: odometry 3e+08 m from one message to the next')
-    assert ahead.startswith('1 message refused: odometry stamp ')
+    assert record.graph.n_poses == len(recording) - 1
+    variance, last = record.skipped
     assert variance.startswith('variance 1e+12 of odometry at ')
     assert last.startswith('the last message is not used: odometry stamp ')
