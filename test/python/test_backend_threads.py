@@ -235,7 +235,6 @@ def test_what_one_thread_sees_is_of_one_map_whatever_others_do():
             for k in range(first, first + 50):
                 drive(backend, k, k + 1, step=1 + first / 1e3)
                 backend.update(0.0)
-            backend.settle()
             now = backend.snapshot()
             backend.reset()
             assert len(now.stamps) == 50 and is_whole(now.stamps, now.poses)
