@@ -10,10 +10,10 @@
 
 import numpy as np
 import pytest
+from heard import hear
 from laps import LAP, Laps, late
 from messages import TYPES, header, odometry, of_rosbags, pose_with_covariance
 from numpy.testing import assert_array_equal
-from problems import hear
 from records import read
 from rosbags.rosbag2 import StoragePlugin
 
@@ -47,12 +47,8 @@ def test_a_recording_makes_the_graph_that_the_node_makes(tmp_path, fault):
                'silence': lambda: laps.silent(LAP + 7.0, LAP + 11.0),
                'disorder': lambda: late(laps.samples(), 0.2, 1.0, np.random.default_rng(0)),
                }[fault]()
-    found, live, refused = laps.heard(samples), l1.Backend(), []
-    for one in found:
-        try:
-            hear(live, [one])
-        except l1.L1SlamError as error:
-            refused.append(str(error))
+    found, live = laps.heard(samples), l1.Backend()
+    refused = hear(live, found)
     now = live.snapshot()
     write(tmp_path / 'bag', found)
     record = read(tmp_path / 'bag')
