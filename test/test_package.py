@@ -191,9 +191,20 @@ def lowest(requirement):
     return f'{Requirement(requirement).name}=={bound.version}.*'
 
 
+def damage(cache):
+    """Leave half of one file of a cache, another one of something else, one with a wrong bit."""
+    first, other, last = (next(cache.glob(f'*.{name}')) for name in ('se2', 'symbolic', 'blocks'))
+    whole = first.read_bytes()
+    first.write_bytes(whole[:len(whole) // 2])
+    other.write_text('nothing of ours')
+    whole = bytearray(last.read_bytes())
+    whole[len(whole) // 2] ^= 4
+    last.write_bytes(whole)
+
+
 @pytest.mark.parametrize('version', ['3.10', '3.11', '3.12'])
 def test_every_python_makes_the_same_map(wheel, requirements, version, tmp_path):
-    """On the oldest one it is solved, too, which compiles for a minute."""
+    """On the oldest one it is solved, too: what that compiles may be damaged later."""
     python = interpreter(version)
     if python is None:
         pytest.skip(f'no Python {version} on this machine')
@@ -204,17 +215,24 @@ def test_every_python_makes_the_same_map(wheel, requirements, version, tmp_path)
     needed = environment(*(map(lowest, requirements) if oldest else requirements), python=python)
     fresh = new_environment(tmp_path / 'fresh', python, below=needed)
     fresh.install('--no-index', wheel.filename)
-    solve = ['solve'] * oldest
-    found = json.loads(fresh.run('python', '-c', SMOKE, *solve, cwd=tmp_path))
+    solve, cache = ['solve'] * oldest, tmp_path / 'cache'
+
+    def made(name, python=fresh.python, env=None):
+        (tmp_path / name).mkdir()
+        return json.loads(run(python, '-c', SMOKE, *solve, cwd=tmp_path / name,
+                              env=env or own_variables(NUMBA_CACHE_DIR=str(cache))))
+
+    found = made('cold')
     assert found['python'] == version and not found['ros']
     assert found['numpy'].startswith('1.26.' if oldest else '2.')
     # Compilers order sums differently, and a solver stops within 10^-6 of the optimum.
-    (tmp_path / 'here').mkdir()
-    here = json.loads(run(sys.executable, '-c', SMOKE, *solve, cwd=tmp_path / 'here',
-                          env={**os.environ}))
+    here = made('here', sys.executable, {**os.environ})
     assert found['costs'] == pytest.approx(here['costs'], rel=1e-6)
     np.testing.assert_allclose(found['edges'], here['edges'], rtol=1e-9, atol=1e-9)
     assert len(here['edges']) == 250
+    if oldest:
+        damage(cache)
+        assert made('again') == found
 
 
 @pytest.mark.parametrize('kind', ['editable', 'wheel'])
