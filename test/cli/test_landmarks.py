@@ -102,6 +102,17 @@ def test_a_false_first_sighting_is_refused_as_any(tmp_path, capsys):
     assert found['slips'] == []
 
 
+def test_start_from_odometry_and_from_the_solved_file(tmp_path, capsys):
+    world = TagWorld(0, 300, 6, 0.1)
+    out = tmp_path / 'solved.g2o'
+    found = solved(capsys, tmp_path, world, '--start', 'odometry', '--output', out)
+    again = solve_json(capsys, out, '--start', 'file')
+    assert again['rejected'] == found['rejected'] and len(found['rejected']) == len(world.false)
+    assert again['initial_cost'] <= found['initial_cost'] * (1 + 1e-6)
+    text = out.read_text()
+    assert text.count('\nVERTEX_SE2 ') + text.startswith('VERTEX_SE2 ') == 306
+
+
 def test_info_counts_landmarks_and_finds_no_gap_at_them(tmp_path, capsys):
     TagWorld(0, 300, 6).write(tmp_path / 'tags.g2o', ids=IDS['tags_between'])
     out, _ = run(capsys, 'info', tmp_path / 'tags.g2o')

@@ -166,3 +166,26 @@ def test_too_much_fill_is_refused():
         with pytest.raises(FillError, match=f'20 keyframes and {below} factors .* {least} blocks '
                            'or more'):
             find_pattern(keyframe, 20, most)
+
+
+@pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)
+def test_the_panels_and_the_work_are_those_of_dense_elimination(shape):
+    pattern = find_pattern(np.array(shape(N)), N, PLENTY)
+    expected, stored = np.eye(N, dtype=bool), np.zeros((N, N), bool)
+    for i, j in shape(N):
+        if max(i, j) < N:
+            one, other = pattern.position[[i, j]]
+            expected[one, other] = expected[other, one] = True
+    for k in range(N):
+        below = k + 1 + np.flatnonzero(expected[k + 1:, k])
+        expected[np.ix_(below, below)] = True
+    expected = np.tril(expected)
+    for s, first in enumerate(pattern.first[:-1]):
+        rows = pattern.rows[pattern.start[s]:pattern.start[s + 1]]
+        stored[np.ix_(rows, range(first, pattern.first[s + 1]))] = True
+    stored = np.tril(stored)
+    assert not (expected & ~stored).any()
+    # Panels hold some zeros for the sake of being large: no more than is said.
+    assert stored.sum() <= expected.sum() / (1 - 0.2)
+    # Half of the square of each column: its products with itself below the diagonal.
+    assert pattern.work == (expected.sum(axis=0).astype(float) ** 2).sum() / 2

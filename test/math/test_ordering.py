@@ -125,6 +125,25 @@ def test_what_is_cut_leaves_small_parts_that_come_first(dissect):
     assert len(rows) == sum(map(len, eliminate(*graph, order)))
 
 
+def tree(n, rng):
+    return [(int(rng.integers(k)), k) for k in range(1, n)]
+
+
+def scattered(n, rng):
+    """Return the pairs of ten paths that nothing joins, and of nodes without any."""
+    return [(k, k + 1) for k in range(n - 1) if k % (n // 10) and k % 7]
+
+
+@BOTH
+@pytest.mark.parametrize('shape', [tree, planar, scattered])
+def test_every_graph_is_ordered_whole_and_its_parts_are_apart(dissect, shape, rng):
+    graph = adjacency_of(shape(700, rng), 700)
+    stage = dissect(*graph)
+    order, _, rows = minimum_degree(*graph, stage)
+    assert_array_equal(np.sort(order), np.arange(700))
+    assert len(rows) == sum(map(len, eliminate(*graph, order)))
+
+
 def work(graph, stage):
     _, column, _ = minimum_degree(*graph, stage)
     return float(((np.diff(column) + 1.0)**2).sum() / 2)
