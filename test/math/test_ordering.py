@@ -142,6 +142,7 @@ def test_every_graph_is_ordered_whole_and_its_parts_are_apart(dissect, shape, rn
     order, _, rows = minimum_degree(*graph, stage)
     assert_array_equal(np.sort(order), np.arange(700))
     assert len(rows) == sum(map(len, eliminate(*graph, order)))
+    assert_array_equal(stage, dissect(*graph))
 
 
 def work(graph, stage):
