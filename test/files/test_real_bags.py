@@ -124,3 +124,33 @@ def test_faults_of_the_odometry_are_told(tmp_path, graph_of, world):
     variance, last = record.skipped
     assert variance.startswith('variance 1e+12 of odometry at ')
     assert last.startswith('the last message is not used: odometry stamp ')
+
+
+def changed(message, change):
+    topic, msgtype, time, data = message
+    decoded = TYPES.deserialize_cdr(data, msgtype)
+    change(decoded)
+    return topic, msgtype, time, bytes(TYPES.serialize_cdr(decoded, msgtype))
+
+
+def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, graph_of, world):
+    recording = list(world[1])
+
+    def broken(k, change):
+        recording[k] = changed(recording[k], change)
+
+    odometry = [k for k, m in enumerate(recording) if m[0] == '/odom']
+    loops = [k for k, m in enumerate(recording) if m[0] == '/loop_closures']
+    broken(odometry[50], lambda m: setattr(m.pose.pose.position, 'x', np.nan))
+    broken(odometry[60], lambda m: setattr(m.header.stamp, 'sec', 0))
+    broken(loops[3], lambda m: setattr(m.header, 'frame_id', 'map'))
+    broken(loops[4], lambda m: setattr(m.header.stamp, 'sec', 2_000_000))
+    record = graph_of(mcap_file(tmp_path / 'a.mcap', recording), every=True)
+    for said, start in zip(sorted(record.skipped), [
+            '1 loop not used: the odometry ends before its times',
+            "1 message refused: frame 'map' of a loop; expected base_link@",
+            '1 message refused: pose (nan, ', '1 message refused: stamp 0 s 0 ns; expected'],
+            strict=True):
+        assert said.startswith(start)
+    assert all('expected' in sentence for sentence in record.skipped if 'refused' in sentence)
+    assert record.graph.n_poses == 118
