@@ -58,7 +58,8 @@ def demos(tmp_path_factory):
     """Return the ends of three demos at once, in a shell of odd words, beside another node."""
     folders = [tmp_path_factory.mktemp(name) for name in ('right', 'doctored', 'killed')]
     (folders[0] / 'bags').mkdir()
-    made(folders[0] / 'bags' / 'demo', 80, 120, '--false-loops', 4, '--scans')
+    # Each of these false loops is more than 3 m off: none may be right by what scans show.
+    made(folders[0] / 'bags' / 'demo', 80, 120, '--false-loops', 4, '--scans', '--seed', 7)
     for folder in folders[1:]:
         shutil.copytree(folders[0] / 'bags', folder / 'bags')
     # One of the false loops is called a true one.
