@@ -30,9 +30,9 @@ endef
 demo: $(STAMP)
 	$(VENV)/bin/python -m l1slam_ros.ros.executables
 
-# Four at a time also on two cores: many wait, for a node, a bag or a registry.
+# Three at a time also on two cores: many wait, for a node, a bag or a registry.
 test: $(TESTS)
-	$(VENV)/bin/python -m pytest -n 4 --dist worksteal
+	$(VENV)/bin/python -m pytest -n 3 --dist worksteal
 
 clean:
 	rm -rf $(VENV) build demo dist install log *.egg-info

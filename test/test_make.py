@@ -31,7 +31,7 @@ esac
 VENV = '-m venv .venv'
 DEMO = ['-m pip install --quiet --editable .[ros]', '-m l1slam_ros.ros.executables']
 TEST = ['-m pip install --quiet l1slam_ros[test]', 'setup.py --quiet install_data',
-        '-m pytest -n 4 --dist worksteal']
+        '-m pytest -n 3 --dist worksteal']
 
 
 @pytest.fixture

@@ -271,6 +271,7 @@ def workspace(request, source, tmp_path_factory):
     return folder
 
 
+@pytest.mark.parametrize('workspace', [[]], ids=['plain'], indirect=True)
 def test_colcon_tests_a_workspace(workspace, tmp_path):
     """By a part of the suite, with what the running Python has."""
     colcon = environment(*COLCON).prefix / 'bin' / 'colcon'
