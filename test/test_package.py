@@ -235,16 +235,11 @@ def test_every_python_makes_the_same_map(wheel, requirements, version, tmp_path)
         assert made('again') == found
 
 
-@pytest.mark.parametrize('kind', ['editable', 'wheel'])
-def test_a_type_checker_finds_the_types_in_every_kind_of_install(wheel, source, kind, tmp_path):
-    """As `make` installs it, `--editable`, and as users do; strictly, and by a user's file."""
+def test_a_type_checker_finds_the_types_of_the_installed_wheel(wheel, tmp_path):
+    """Strictly, by a user's file."""
     tools = environment('mypy~=2.4.1', 'numpy', 'setuptools>=70.1')
     fresh = new_environment(tmp_path / 'fresh', sys.executable, below=tools)
-    if kind == 'editable':
-        copy = shutil.copytree(source, tmp_path / 'copy', symlinks=True)
-        fresh.install('--no-deps', '--no-build-isolation', '--editable', copy)
-    else:
-        fresh.install('--no-deps', '--no-index', wheel.filename)
+    fresh.install('--no-deps', '--no-index', wheel.filename)
     example = re.search(r'## .*Python.*?```python\n(.*?)```', (ROOT / 'README.md').read_text(),
                         re.S)[1]
     (tmp_path / 'right.py').write_text(example)

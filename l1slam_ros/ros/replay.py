@@ -23,6 +23,7 @@ from pathlib import Path
 import rclpy
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -293,6 +294,10 @@ def main() -> int:
         _play(arguments, tell)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except rclpy_implementation.RCLError:
+        if rclpy.ok():
+            raise
+        # A signal has shut ROS down just when something was published.
     except (L1SlamError, OSError) as error:
         say(str(error), 'replay')
         return _BAD_INPUT
