@@ -15,7 +15,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_bench import EVERY_MESSAGE, loop, odometry, stamp_of
+from node_bench import EVERY_MESSAGE, loop, odometry
 from visualization_msgs.msg import Marker, MarkerArray
 
 from bags import write_world
@@ -126,19 +126,3 @@ def test_the_covariance_is_that_of_the_sum_of_all_motions(bench):
     np.testing.assert_allclose(whole, expected, rtol=1e-4, atol=1e-9)
     assert not whole[2:5].any()
     assert heard[-1].header.frame_id == 'map'
-
-
-def test_transforms_reach_to_the_odometry_that_comes_next(bench):
-    """That of a bag played fast, or that comes seldom: by more than the tolerance."""
-    b = bench(transform_period=3600.0)
-    for k in range(5):
-        b.drive(k, k + 1)
-        b.until(lambda k=k: len(b.received['map_to_odom']) == k + 2, 'a transform with a message')
-    # tf2 looks up between two: at first, before it is known how seldom, one at the stamp itself.
-    assert [stamp_of(message.header) for message in b.received['map_to_odom']] == [
-        10**9, 13 * 10**8, 23 * 10**8, 45 * 10**8, 55 * 10**8, 65 * 10**8]
-    # The longest pause but one counts, and two seconds at most; a time that goes back begins anew.
-    for stamp, end in (8, 0), (14, 15.5), (17, 0), (27, 29), (2, 0), (3, 3.3):
-        b.send('/odom', odometry(stamp * 10**9, 5.0))
-        b.until(lambda end=end: not end or stamp_of(b.received['map_to_odom'][-1].header) == round(
-            end * 10**9), f'a transform up to {end} s')
