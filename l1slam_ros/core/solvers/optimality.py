@@ -270,7 +270,8 @@ class Mixed:
         return [(norm, factors[own].ravel()) for norm, own in self.parts]
 
     def _joined(self, found: list[Array]) -> Array:
-        rows = np.empty((len(self.parts[0][1]), sum(map(len, found)) // len(self.parts[0][1])))
+        m = len(self.parts[0][1])
+        rows = np.empty((m, sum(map(len, found)) // m))
         for (_, own), part in zip(self.parts, found, strict=True):
             rows[own] = part.reshape(-1, rows.shape[1])  # a part may have no factors
         return rows.ravel()

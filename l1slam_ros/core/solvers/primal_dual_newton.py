@@ -24,7 +24,7 @@ a norm without corners has its derivative and its weights (`optimality.SmoothNor
 
 Source: Chan, Golub and Mulet, "A nonlinear primal-dual method for total variation-based image
 restoration" (1999), sections 3 and 4; the curvature is ours, defended by
-`test_primal_dual_newton.py`.
+`test_norms.py`.
 """
 
 from dataclasses import dataclass, replace

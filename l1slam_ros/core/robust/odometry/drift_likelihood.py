@@ -25,7 +25,7 @@ angles only propose drifts. Which ones may be, positions decide, with the covari
 of all steps between makes of angle and position. Laps may close with a turn more on each even so,
 and loops of two laps share most of their errors, which is not counted here: `drift` decides.
 
-Source: ours, by the recorded logs that `test_drift.py` names where they are.
+Source: ours, defended by `test_drift.py`.
 """
 
 import numpy as np

@@ -22,7 +22,6 @@ from l1slam_ros.core.bordered.front import Front, Look
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
 from l1slam_ros.core.robust.forecast import expected_error
 from l1slam_ros.core.robust.judgement import Judgement
@@ -30,7 +29,7 @@ from l1slam_ros.core.running.improve import Check, front_of, improve, one_round
 from l1slam_ros.core.running.keeper.keeper import Keeper
 from l1slam_ros.core.running.keeper.schedule import Moment, Work, is_late
 from l1slam_ros.core.running.keeper.workers import until
-from l1slam_ros.core.running.problem import as_numbered, as_one, by_robot
+from l1slam_ros.core.running.problem import Problem, as_numbered, as_one, by_robot
 from l1slam_ros.core.running.snapshot import Snapshot
 
 # [s] Time for which a map is improved, whatever the budget; and by what factor a round may take
@@ -61,7 +60,7 @@ def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
     solver = keeper.solver
     whole = now.problem()
     pending = now.state.pending
-    looked, began = now.looked, now.state.began
+    looked = now.looked
     del now  # holds the factors of a front that may be replaced meanwhile
     problem = as_one(whole)
     if pending is None:
@@ -75,19 +74,19 @@ def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
     check()
     front = front_of(problem, improvement.poses, looked, check)
     looks = [] if front is None else _caught_up(
-        keeper, began, front, whole.judgement.accepted, pending is not None, check)
+        keeper, front, whole, pending is not None, check)
     check()
     keeper.adopt(improvement.of_all(whole), front, pending, looks)
 
 
-def _caught_up(keeper: Keeper, began: int, front: Front, part: Mask, again: bool,
+def _caught_up(keeper: Keeper, front: Front, whole: Problem, again: bool,
                check: Check) -> list[Look]:
     """
     Let a new front take what came while it was made; return what it says of that.
 
     What came during one pass is left to the next one, as long as that is less than it was: what is
-    left at the end is left to an update, for which a caller waits. began : names the map; part,
-    again : see `FactorTable.for_new_front`
+    left at the end is left to an update, for which a caller waits. whole : the problem that the
+    front's map solves; again : see `FactorTable.for_new_front`
 
     Raises
     ------
@@ -98,9 +97,9 @@ def _caught_up(keeper: Keeper, began: int, front: Front, part: Mask, again: bool
     left = np.inf
     while not front.closed:
         state, factors, _ = keeper.look()
-        if state.began != began:
+        if state.began != whole.map:
             raise Interrupted
-        what = state.table.for_new_front(factors, part, again)
+        what = state.table.for_new_front(factors, whole.judgement.accepted, again)
         before, left = left, len(what) - front.rows
         if not 0 < left < before:
             break
