@@ -12,7 +12,7 @@ How many small faults in the package the tests notice (mutation testing).
     python benchmarks/mutants.py cover TREE FOLDER [--jobs 3]
     python benchmarks/mutants.py draw TREE MUTANTS.json [--count 200] [--seed 1]
     python benchmarks/mutants.py run TREE MUTANTS.json FOLDER RESULTS.json [--jobs 2]
-                                 [--seconds 90] [--survivors OTHER.json]
+                                 [--seconds 60] [--survivors OTHER.json]
 
 A mutant is one change of one expression in core, io or ros: another operator or comparison, a
 number one larger, a condition negated, None returned. `cover` runs the tests of a checkout once
@@ -238,7 +238,7 @@ def failing(tree: Path, tests: list[str], seconds: float, variables: dict[str, s
     return named[0] if named else None if process.returncode in (0, 4, 5) else 'the run itself'
 
 
-def run(tree: Path, mutants: list[Mutant], covered: Path, jobs: int, seconds: float
+def run(tree: Path, mutants: list[Mutant], covered: Path, jobs: int, seconds: int
         ) -> list[Trial]:
     """Return what became of each mutant."""
     by_line = tests_of_lines(covered, tree)
@@ -303,16 +303,16 @@ def main() -> None:
     """Do what the command line says."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     commands = parser.add_subparsers(dest='command', required=True)
-    for name, words in (('cover', ('tree', 'folder')), ('draw', ('tree', 'mutants')),
-                        ('run', ('tree', 'mutants', 'folder', 'results'))):
+    for name, words, options in (
+            ('cover', ('tree', 'folder'), {'--jobs': 3}),
+            ('draw', ('tree', 'mutants'), {'--count': 200, '--seed': 1}),
+            ('run', ('tree', 'mutants', 'folder', 'results'), {'--jobs': 2, '--seconds': 60})):
         command = commands.add_parser(name)
         for word in words:
             command.add_argument(word, type=lambda text: Path(text).resolve())
-        command.add_argument('--jobs', type=int, default=2)
-        command.add_argument('--count', type=int, default=200)
-        command.add_argument('--seed', type=int, default=1)
-        command.add_argument('--seconds', type=float, default=90.)
-        command.add_argument('--survivors', type=Path)
+        for option, default in options.items():
+            command.add_argument(option, type=int, default=default)
+    command.add_argument('--survivors', type=Path)
     given = parser.parse_args()
     if given.command == 'cover':
         cover(given.tree, given.folder, given.jobs)

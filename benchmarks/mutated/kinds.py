@@ -19,6 +19,7 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 import l1slam_ros as l1
 from l1slam_ros.cli.main import main as command
@@ -245,12 +246,9 @@ def _write_bags(folder: Path) -> None:
         (part / 'metadata.yaml').unlink()
     (folder / 'splits/bag/metadata.yaml').write_text(text.replace('  - bag_2.mcap\n', ''.join(
         f'  - bag_{k}.mcap\n' for k in range(3))))
-    with Rosbag1Writer(folder / 'ros1/bag.bag') as writer:
-        known = {}
-        for topic, msgtype, time, data in recording:
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, msgtype, typestore=ROS1)
-            writer.write(known[topic], time, TYPES.cdr_to_ros1(data, msgtype))
+    _write_messages(Rosbag1Writer(folder / 'ros1/bag.bag'), ROS1, [
+        (topic, msgtype, time, TYPES.cdr_to_ros1(data, msgtype))
+        for topic, msgtype, time, data in recording])
     _write_bag(folder / 'pose_graph/bag', [
         ('/pose_graph', POSE_GRAPH, 10**12,
          bytes(TYPES.serialize_cdr(_pose_graph(), POSE_GRAPH)))], mcap)
@@ -281,11 +279,16 @@ def _write_bag(path: Path, recording: list[tuple], plugin: StoragePlugin,
     writer.set_compression(mode, CompressionFormat.ZSTD)
     if path.parent.name != 'pose_graph':
         writer.set_custom_data('l1slam', NOTE)
+    _write_messages(writer, TYPES, recording)
+
+
+def _write_messages(writer: Rosbag1Writer | Rosbag2Writer, types: Typestore,
+                    recording: list[tuple]) -> None:
     with writer:
         known = {}
         for topic, msgtype, time, data in recording:
             if topic not in known:
-                known[topic] = writer.add_connection(topic, msgtype, typestore=TYPES)
+                known[topic] = writer.add_connection(topic, msgtype, typestore=types)
             writer.write(known[topic], time, data)
 
 
