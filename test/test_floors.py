@@ -9,8 +9,7 @@
 """The walls of the package, read off its source: who may import whom, and how long things are."""
 
 import ast
-import io
-import tokenize
+import re
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -68,21 +67,6 @@ def imports(module):
             inside = {f'{node.module}.{alias.name}' for alias in node.names} & FILES.keys()
             found.update(inside or {node.module})
     return found
-
-
-def code_lines(path):
-    """Return the numbers of the lines of a file without docstrings, comments and blanks."""
-    text = path.read_text()
-    documented = [node for node in ast.walk(ast.parse(text))
-                  if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-                  and ast.get_docstring(node)]
-    docstrings = {line for node in documented
-                  for line in range(node.body[0].lineno, node.body[0].end_lineno + 1)}
-    layout = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT,
-              tokenize.ENDMARKER}
-    lines = {line for token in tokenize.generate_tokens(io.StringIO(text).readline)
-             if token.type not in layout for line in range(token.start[0], token.end[0] + 1)}
-    return lines - docstrings
 
 
 def ours(module):
@@ -166,6 +150,8 @@ def inside(path):
                 names |= {alias.name for alias in node.names}
             case ast.ImportFrom():
                 names |= {node.module, *(f'{node.module}.{alias.name}' for alias in node.names)}
+            case ast.Constant(value=str(text)):  # what a process is given to run
+                names |= {*re.findall(rf'\b(?:from|import) ({PACKAGE}\.[\w.]+)', text)}
             case ast.Attribute(value=of, attr=name) if name in PRIVATE:
                 names |= set() if getattr(of, 'id', '') == 'self' else {f'{PACKAGE}.{name}'}
     return {name for name in names if name.startswith(f'{PACKAGE}.')} - DOORS

@@ -17,6 +17,7 @@ import re
 import struct
 import subprocess
 import sys
+import sysconfig
 import termios
 import time
 from contextlib import suppress
@@ -116,7 +117,7 @@ def test_a_signal_leaves_nothing_half_written(graph, name):
 
 # Interrupts a process amid an import, a call from machine code, or a destructor: `point` of them.
 INTERRUPT = """
-import signal, sys
+import runpy, signal, sys
 
 class Last:
     def __del__(self):
@@ -135,10 +136,11 @@ sys.addaudithook(lambda event, about: now() if not came and event == 'import' an
     'destructor': 'numpy'}.get(point, point) else None)
 sys.setprofile(lambda frame, event, called: now() if not came and event == 'c_call' and
                f'{called.__module__}.{called.__name__}' == point else None)
-{ENTRY}
-code = main()
-sys.exit(code if came else 'not reached')
-""".replace('{ENTRY}', 'from l1slam_ros.cli.entry import main')  # as the executable does
+try:
+    runpy.run_path(SCRIPT, run_name='__main__')
+except SystemExit as ended:
+    sys.exit(ended.code if came else 'not reached')
+""".replace('SCRIPT', repr(str(Path(sysconfig.get_path('scripts'), 'l1slam'))))
 
 
 @pytest.mark.parametrize('point', ['argparse', 'numpy', 'datetime', 'llvmlite', '_pickle.loads',

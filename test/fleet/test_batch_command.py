@@ -15,6 +15,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import sysconfig
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,6 +25,7 @@ from command import run
 from worlds import made
 
 SECONDS = 120  # of patience
+L1SLAM = str(Path(sysconfig.get_path('scripts'), 'l1slam'))
 
 
 @pytest.fixture(scope='module')
@@ -53,9 +55,10 @@ def command(folder, output, *options, **environment):
     """Start the command on two workers."""
     where = () if {'--scheduler', '--workers'} & {*options} else ('--workers', '2')
     return subprocess.Popen(
-        [sys.executable, '-c', 'import signal, sys; from l1slam_ros.cli.entry import main; '
-         'signal.signal(signal.SIGINT, signal.default_int_handler); sys.exit(main())', 'batch',
-         folder, '--output', output, *where, *options],
+        [sys.executable, '-c', 'import runpy, signal; '
+         'signal.signal(signal.SIGINT, signal.default_int_handler); '
+         f'runpy.run_path({L1SLAM!r}, run_name="__main__")', 'batch', folder, '--output', output,
+         *where, *options],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment)
 
 
