@@ -232,7 +232,10 @@ def test_every_python_makes_the_same_map(wheel, requirements, version, tmp_path)
     assert len(here['edges']) == 250
     if oldest:
         damage(cache)
-        assert made('again') == found
+        again = made('again')
+        # What is compiled at its first call may round otherwise than what was kept.
+        assert again.pop('costs') == pytest.approx(found.pop('costs'), rel=1e-14)
+        assert again == found
 
 
 def test_a_type_checker_finds_the_types_of_the_installed_wheel(wheel, tmp_path):
