@@ -22,7 +22,6 @@ from l1slam_ros.core.robust.judgement import (
     FAILED,
     NO_WHEELS,
     NORM,
-    ONE_JOINS,
     OTHER_MAP,
     PARTS,
     SLIP,
@@ -70,13 +69,9 @@ _TOGETHER = ('the errors of loops of one place are correlated: each place counts
 
 # Kind of a doubt -> its sentence.
 _REASONS = {
-    WEAK: 'the map may well be {detail} m off: with the noise that was estimated, the loops that '
-          'are used allow that much; {count} are left out, {where}',
-    UNCONFIRMED: 'the odometry alone hardly confirms {loops} in use, {where}: false ones could '
-                 'fit as well',
-    ONE_JOINS: 'two parts of the map are joined only by loops of one place ({loops}, {where}), '
-               'which may be one mistake',
-    OTHER_MAP: '{count} refused loops agree with each other on another map, {where}',
+    WEAK: 'no loop is accepted, so the map is the odometry; {loops} left out, {where}',
+    UNCONFIRMED: 'all else hardly confirms {loops} in use, {where}: false ones could fit as well',
+    OTHER_MAP: '{loops} refused, {where}, may be right: then the map is another one',
     SLIP: 'the odometry may have slipped {where}: undecided by {loops} across it',
     DRIFTS: 'the odometry may turn by about {detail} rad per metre too much, {where}, undecided '
             'by the {loops} in use',
@@ -94,8 +89,6 @@ _REASONS = {
     PARTS: 'no accepted loop joins {detail} parts of the map, {where}, so their relative poses '
            'are guesses; {loops} between them are left out',
 }
-# Of a weak map without any accepted loop.
-_NONE_ACCEPTED = 'no loop is accepted, so the map is the odometry; {loops} left out, {where}'
 _REMEDY = 'Vouch for a true loop, strike out a false one, or state the right noise'
 
 
@@ -192,10 +185,8 @@ def doubt_reasons(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None)
         if stamps is not None:
             first, last = stamp_text(stamps[doubt.first]), stamp_text(stamps[doubt.last])
             where += f' ({first} s to {last} s)'
-        sentence = _NONE_ACCEPTED if (
-            doubt.kind == WEAK and not doubt.detail) else _REASONS[doubt.kind]
-        reasons.append(sentence.format(loops=counted(doubt.loops, 'loop'), where=where,
-                                       count=f'{doubt.loops:,}', detail=doubt.detail))
+        reasons.append(_REASONS[doubt.kind].format(
+            loops=counted(doubt.loops, 'loop'), where=where, detail=doubt.detail))
     return reasons
 
 

@@ -53,7 +53,7 @@ def test_what_is_twice_as_noisy_as_it_says_or_more_is_told(
         found = re.search(f'^{sentence}$', said, re.M)
         assert bool(found) == (sentence in expected), said
         if found:
-            assert float(found[1]) == pytest.approx(expected[sentence], rel=0.25)
+            assert float(found[1]) == pytest.approx(expected[sentence], rel=0.3)
 
 
 def test_where_the_odometry_alone_states_the_identity_it_alone_is_said_to(capsys, tmp_path, world):

@@ -59,7 +59,7 @@ def weak(path, edges, seed):
 # A name of each: what makes it.
 DOUBTFUL = {
     'a ring': ring, 'a slip': lambda path: slipping(made(path, 400, 430, '--seed', 4), 200, 0.4),
-    'a weak map': lambda path: weak(path, 604, 0), 'torn': lambda path: (torn(path), path)[1]}
+    'a weak map': lambda path: weak(path, 601, 0), 'torn': lambda path: (torn(path), path)[1]}
 
 
 def shown(page):
@@ -97,12 +97,12 @@ def test_a_page_shows_each_loop_once_with_its_fate_and_the_doubted(solve):
     assert len(pairs) == data['loops'] == report['loops'] == len(here['fate'])
     assert [pair for pair, fate in zip(pairs, here['fate'], strict=True)
             if words[fate] == 'rejected'] == report['rejected']
-    doubt, = data['doubts']
+    doubt = data['doubts'][0]
     assert doubt['text'] == report['doubts'][0]['text']
     assert [pairs[k] for k in doubt['loops']] == report['doubts'][0]['loops']
     assert all(sigmas is not None for sigmas in here['sigmas'])
     # In the rival the doubted loops are in the map, and the map is another.
-    rival, = data['maps'][1:]
+    rival = data['maps'][1]
     assert {words[rival['fate'][k]] for k in doubt['loops']} == {'trusted'}
     assert rival['doubt'] == 0 and 'm from the map that was solved' in rival['note']
     assert np.abs(np.array(rival['at']) - here['at']).max() > 1
@@ -133,7 +133,8 @@ def test_a_doubt_is_settled_through_the_page(capsys, solve):
             beside.unlink()
             assert after['status'] == ('doubtful' if after['doubts'] else 'converged')
             for doubt in after['doubts']:
-                assert not [loop for loop in doubt['loops'] if loop in loops], (kind, doubt)
+                assert doubt['kind'] == 'another norm' or not any(
+                    loop in loops for loop in doubt['loops']), (kind, doubt)
 
 
 def test_what_was_said_is_ticked_in_the_next_page(capsys, tmp_path, solve):
@@ -236,6 +237,7 @@ def test_a_named_slip_is_in_the_rival_and_is_not_ticked(capsys, tmp_path):
     path = slipping(weak(tmp_path / 'world.g2o', 606, 1), 300, 6)
     page, report = reported(capsys, path)
     assert report['slips'] == [[300, 301]]
+    name = shown(page)['maps'][1]['name'].removeprefix('rival: ')
     found, complaints = opened(page, f"""{HEAD} {PRESS}
         const box = document.getElementById('search'), row = () => [...document.querySelectorAll(
           '#rows tr')].find(one => one.cells[1].textContent === '301').cells[2].textContent;
@@ -243,10 +245,10 @@ def test_a_named_slip_is_in_the_rival_and_is_not_ticked(capsys, tmp_path):
         const ticked = document.getElementById('trusted').value.includes('300 301');
         box.value = '300 301'; box.dispatchEvent(new Event('input')); await wait(400);
         const inputs = document.querySelectorAll('#rows input').length, before = row();
-        press('See the rival: every loop believed'); await wait(400);
-        return [ticked, inputs, before, row(), words('note')];""")
+        press('See the rival: ' + {json.dumps(name)}); await wait(400);
+        return [ticked, inputs, before, words('note')];""")
     assert complaints == []
-    assert found == [False, 0, 'slip', 'odometry', shown(page)['maps'][1]['note']]
+    assert found == [False, 0, 'slip', shown(page)['maps'][1]['note']]
 
 
 def test_keyframes_of_a_bag_have_stamps_and_the_page_says_to_make_a_graph_first(

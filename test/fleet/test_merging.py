@@ -116,7 +116,7 @@ def test_what_does_not_join_lies_beside_and_is_said(world, tmp_path, capsys):
     assert found['final_cost'] == pytest.approx(sum(alone), rel=1e-3)
 
 
-def test_one_place_that_alone_joins_is_doubted(world, tmp_path, capsys):
+def test_one_place_that_alone_joins_is_left_out_and_named(world, tmp_path, capsys):
     paths, between = cut(world, tmp_path)
     ends = np.array([[int(word.partition(':')[2]) for word in line.split()[1:3]]
                      for line in between])
@@ -126,7 +126,8 @@ def test_one_place_that_alone_joins_is_doubted(world, tmp_path, capsys):
     loops = listed(tmp_path, [line for line, is_near in zip(between, one, strict=True) if is_near])
     found, said = merge_json(capsys, *paths, '--loops', loops, '--output', tmp_path / 'out.g2o',
                              code=4)
-    assert found['doubts'][0]['kind'] and 'joined only by loops of one place' in said
+    assert found['doubts'][0]['kind'] == 'parts' and 'no accepted loop joins 2' in said
+    assert len(found['doubts'][0]['loops']) == one.sum()
 
 
 @pytest.mark.parametrize(('line', 'sentence'), [

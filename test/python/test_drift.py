@@ -27,7 +27,7 @@ def test_the_map_is_made_without_the_drift_that_loops_agree_on(drift, kind, norm
 
 
 @pytest.mark.parametrize(('lies', 'drift', 'taken'), [
-    (100, 0.004, True), (100, 0.002, False), (0, 0.002, False)])
+    (100, 0.01, True), (100, 0.004, False), (0, 0.002, False)])
 def test_a_drift_is_taken_beyond_what_the_odometry_states(lies, drift, taken):
     """Within that it is left, with lies as without: by it no place is won."""
     found = solved(careful(400, 800, lies=lies).drifting(drift).restated(3.0, 3.0))
@@ -80,22 +80,22 @@ def test_a_drift_that_passes_for_noise_is_taken_out_and_noise_is_none(seed):
     assert straight.said['drift'] == 0 and not straight.doubts
 
 
-def test_a_map_without_an_accepted_loop_is_hardly_ever_right():
+def test_a_map_without_an_accepted_loop_is_as_likely_wrong():
     drive, rng = out_and_back(), np.random.default_rng(0)
     rows = np.flatnonzero(~drive.is_odometry)
     drive.measured[rows, :2] += rng.uniform(20, 60, (len(rows), 2))
     found = solved(drive)
-    assert found.doubts == ['a weak map'] and found.said['confidence'] < 0.2
+    assert found.doubts == ['a weak map'] and found.said['confidence'] < 0.6
     assert not found.accepted[rows].any()
 
 
 @pytest.mark.parametrize('seed', [3, 6])
-def test_a_vague_map_is_doubtful_though_it_has_all_true_loops(seed):
-    """It is unsure of itself for the odometry, which no loop that is left out would mend."""
+def test_a_vague_map_that_has_all_true_loops_is_not_doubtful(seed):
+    """It is as right as its factors allow, and no loop that is left out would mend it."""
     drive = with_lies(out_and_back(0.0, seed, 14, noisier=10), 5, np.random.default_rng(seed))
     found = solved(drive)
     assert found.kept == found.lost == 0
-    assert found.said['confidence'] < 0.9 and found.doubts == ['a weak map']
+    assert found.said['confidence'] > 0.9 and not found.doubts
 
 
 SIGMAS = np.array([[0.05, 0.05, 0.003], [0.1, 0.1, 0.02]])
@@ -131,13 +131,12 @@ def test_neither_lies_nor_misstated_noise_make_a_drift(n, loops, seed, lies, tim
     assert found.said['drift'] == 0 and found.error < 3
 
 
-@pytest.mark.parametrize(('drift', 'seed', 'doubtful'), [
-    (-0.01, 0, True), (-0.01, 1, False), (-0.01, 4, True), (-0.06, 0, False), (-0.06, 7, False)])
-def test_of_turns_more_that_loops_fit_the_one_is_taken_that_leaves_the_largest_map(
-        drift, seed, doubtful):
-    """The lap may be driven the other way round: doubtful where rivals together are likelier."""
+@pytest.mark.parametrize(('drift', 'seed'), [
+    (-0.01, 0), (-0.01, 1), (-0.01, 4), (-0.06, 0), (-0.06, 7)])
+def test_of_turns_more_that_loops_fit_the_one_is_taken_that_leaves_the_largest_map(drift, seed):
+    """The lap may be driven the other way round, which one place cannot tell."""
     found = solved(ring(400, 20, seed, 15).drifting(drift))
-    assert found.doubts == [DOUBT] * doubtful and (found.said['confidence'] > 0.9) != doubtful
+    assert found.doubts == [DOUBT] and found.said['confidence'] < 0.9
     assert found.said['drift'] == pytest.approx(drift, abs=2e-3) and found.error < 1
     assert found.kept == found.lost == 0
 

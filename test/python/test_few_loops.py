@@ -81,7 +81,7 @@ def test_a_square_of_four_poses_is_closed(tmp_path, capsys):
     found = solve_json(capsys, path, code=4)
     assert not found['rejected'] and not found['suspect'] and found['final_cost'] < 1e-9
     text = run(capsys, 'solve', path, code=4)[1]
-    assert 'doubtful: the odometry alone hardly confirms 1 loop in use' in text
+    assert 'doubtful: all else hardly confirms 1 loop in use' in text
 
 
 @pytest.mark.parametrize('name', ['mrpt_graphslam_SE2_in.graph', 'mrpt_graphslam_SE2_in2.graph',

@@ -56,7 +56,9 @@ def test_false_positions_are_refused_in_every_norm(world, norm):
     found = solved(world, norm)
     assert found.kept == found.lost == 0 and world.false.sum() == 4
     assert error(found.poses, world.truth) < 0.6
-    assert found.said['parts'] == 1 and not found.doubts and found.said['loops'] == 0
+    assert found.said['parts'] == 1 and found.said['loops'] == 0
+    # By L1 the map is twice as far off as by L2, of which all are sure.
+    assert found.doubts == ['another norm'] * (norm == 'l1')
 
 
 @pytest.mark.parametrize(('norm', 'solver'), [

@@ -43,11 +43,11 @@ def test_slips_are_found_together(bad, steps, off):
 
 
 @pytest.mark.parametrize(('stated', 'turn', 'named'), [
-    (1.0, 0.14, [STEP]), (4.0, 0.056, []), (4.0, 0.2, [STEP]), (10.0, 0.14, [STEP])])
+    (1.0, 0.14, [STEP]), (4.0, 0.056, []), (4.0, 0.2, []), (10.0, 0.14, [])])
 def test_what_is_within_the_noise_as_stated_is_no_slip(bad, stated, turn, named):
-    """3 sigmas are none, though loops that know better speak against it; 40 real ones are."""
-    drive = bad.slipped([STEP], [0.0, 0.0, turn]).restated(stated, stated)
-    assert solved(drive).slips == named
+    """Though loops that know better speak against it: they hold the map all the same."""
+    found = solved(bad.slipped([STEP], [0.0, 0.0, turn]).restated(stated, stated))
+    assert found.slips == named and found.error < 0.2 and not found.doubts
 
 
 @pytest.mark.parametrize(('world', 'steps', 'off'), [
@@ -134,16 +134,16 @@ def test_a_slip_that_one_place_alone_shows_is_cut(turn, count):
 
 
 @pytest.mark.parametrize('keyframe', [106, 276])
-def test_two_slips_that_cancel_are_doubted(bad, keyframe):
-    """The loops of one keyframe say, and all others have nothing against it, that it is off."""
+def test_two_slips_that_cancel_bend_no_map(bad, keyframe):
+    """The loops of one keyframe say that it is off, and all others have nothing against it."""
     truth, near = bad.truth.copy(), np.array([keyframe - 1, keyframe])
     truth[keyframe] = compose(truth[keyframe], np.array([0.0, 5.0, 0.0]))
     rows = np.flatnonzero(bad.is_odometry & np.isin(bad.pairs[:, 0], near))
     measured = bad.measured.copy()
     measured[rows] = between(truth[near], truth[near + 1])
     found = solved(replace(bad, measured=measured))
-    assert not found.slips and found.doubts == ['another map']
-    assert keyframe in np.array(found.said['doubts'][0]['loops'])
+    assert not found.slips and found.error < 0.5
+    assert keyframe in np.array(found.said['rejected'] + found.said['suspect'])
 
 
 def test_an_unusual_motion_that_no_loop_spans_is_no_slip(bad):

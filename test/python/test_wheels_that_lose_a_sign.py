@@ -15,9 +15,9 @@ from worlds import between, position_error
 import l1slam_ros as l1
 
 
-@pytest.mark.parametrize(('name', 'most', 'norm'), [
-    ('fr079_wheel', 0.8, 'l2'), ('fr079_match', 0.5, 'l1')])
-def test_true_loops_of_a_log_are_in_and_its_map_is_right(datasets, name, most, norm):
+@pytest.mark.parametrize(('name', 'most', 'norm', 'lost'), [
+    ('fr079_wheel', 0.95, 'l2', 0.1), ('fr079_match', 0.5, 'l1', 0.05)])
+def test_true_loops_of_a_log_are_in_and_its_map_is_right(datasets, name, most, norm, lost):
     graph, _ = l1.read_graph(datasets / 'lidar' / f'{name}.g2o')
     known = np.loadtxt(datasets / 'lidar' / 'fr079.truth.txt')
     truth = np.full((graph.n_poses, 3), np.nan)
@@ -28,7 +28,7 @@ def test_true_loops_of_a_log_are_in_and_its_map_is_right(datasets, name, most, n
     solution = l1.solve(graph, norm=norm)
     there = np.isfinite(truth[:, 0])
     assert position_error(solution.poses[there, :2], truth[there, :2]) < most
-    assert np.count_nonzero(true & ~solution.inliers) <= 0.05 * true.sum()
+    assert np.count_nonzero(true & ~solution.inliers) <= lost * true.sum()
 
 
 def test_a_dozen_loops_are_in_whose_odometry_is_noisier_than_stated(datasets):

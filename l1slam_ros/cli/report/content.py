@@ -25,7 +25,6 @@ from l1slam_ros.core.robust.judgement import (
     FAILED,
     NO_WHEELS,
     NORM,
-    ONE_JOINS,
     OTHER_MAP,
     PARTS,
     SLIP,
@@ -64,8 +63,6 @@ _ADVICE = {
     WEAK: f'Record loops of more places, or calibrate the odometry. {_LOOK}: tick as true those '
           'of places that you know.',
     UNCONFIRMED: f'{_LOOK}. Ticked as true, they settle it; ticked as false, they all go.',
-    ONE_JOINS: f'{_LOOK}. Ticked as true, they join the two parts for good; ticked as false, '
-               'nothing does.',
     OTHER_MAP: 'Switch to the rival map: which of the two is the place as you know it? If it is '
                'the one solved, tick these loops as false. If it is the rival, tick them as true, '
                'and the loops that contradict them as false.',

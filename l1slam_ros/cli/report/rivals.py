@@ -32,7 +32,6 @@ from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions, solve
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
     NORM,
-    ONE_JOINS,
     OTHER_MAP,
     SLIP,
     UNCONFIRMED,
@@ -101,7 +100,7 @@ def _plans(record: GraphRecord, judgement: Judgement, asked: SolveOptions) -> It
     for number, doubt in enumerate(judgement.doubts):
         rows = doubted_rows(doubt, graph.between)
         loops = counted(len(rows), 'loop')
-        if doubt.kind in (UNCONFIRMED, ONE_JOINS) and len(rows):
+        if doubt.kind == UNCONFIRMED and len(rows):
             yield _Plan(f'{loops} struck out', number, _told(graph, rows, False), asked)
         elif doubt.kind == OTHER_MAP and len(rows):
             yield _Plan(f'{loops} vouched for', number, _told(graph, rows, True), asked)

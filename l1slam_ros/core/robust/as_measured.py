@@ -110,11 +110,11 @@ def _stays(graph: FactorGraph, judgement: Judgement) -> bool:
 
 def identity_roots(graph: FactorGraph) -> Array:
     """
-    Return the roots of the information of odometry and of loops where all state the identity.
+    Return the roots of the information where all of a kind state so many times the identity.
 
-    (2, k), the diagonals; NaN where a kind states something else, or there is none. An identity
-    that was read as information of quaternions is 1/4 for angles: their vector part is half of
-    the angle.
+    (2, k) of odometry and of loops, the diagonals of the identity; NaN where a kind states
+    something else, or there is none. An identity that was read as information of quaternions is
+    1/4 for angles: their vector part is half of the angle.
     """
     factors, manifold = graph.between, graph.manifold
     found = np.full((2, manifold.TANGENT_SIZE), np.nan)
@@ -122,7 +122,8 @@ def identity_roots(graph: FactorGraph) -> Array:
         for angles in (1.0,) if manifold is se2 else (1.0, 0.5):
             roots = np.ones(manifold.TANGENT_SIZE)
             roots[manifold.ROTATION] = angles
-            if kind.any() and np.allclose(factors.sqrt_information[kind], np.diag(roots)):
+            stated = factors.sqrt_information[kind]
+            if kind.any() and np.allclose(stated, stated[:, :1, :1] * np.diag(roots)):
                 own[:] = roots
     return found
 

@@ -7,48 +7,33 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Maps that survive lies: which factors to rely on, by growing outward from the odometry.
+Maps that survive lies: which loops are inliers, and how sure that is.
 
 In: a graph, of which nothing is accepted but the odometry and the trusted loops. Out: the loops
-that are accepted, and the L2 map of these. It is the inference of this model:
+that are accepted, their L2 map, and what speaks against it. The model, and what is done with it:
 
-Noise
-    What a file states of its noise may be off by a constant, one for odometry and one for loops:
-    `gating.noise_variance` finds both from the loops themselves (expectation and maximisation),
-    `rounds` measures them again as the map grows. In the last rounds factors may be as noisy as
-    they say, so that no loop is refused for what it was predicted too well; but only loops that
-    fit by the noise that was found, and last of all its tail (`Growth.accept_tail`).
-A true loop
-    measures where its keyframes are, with normal noise. Predicted by the map without it, its
-    innovation r has a covariance C from samples of the map (`innovation`), and r'C^-1 r stays
-    below the gate for all but one in a thousand.
-A lie
-    claims anything: its innovation is uniform over as much as the map is wide, with any rotation.
-    How many of the loops lie is not assumed: the odds come from the loops (empirical Bayes). A
-    loop is accepted where it and all accepted with it lie with a probability of 1% at most. Of two
-    that contradict each other one lies, so each has to be the likelier of both by as much.
-A place
-    is what loops near each other are of, in metres along the way (`places`). Lies of one place
-    may be one mistake: together they count once. A loop most of whose neighbours there are refused
-    is the less likely, the rarer true ones were found beside such. The evidence of several places
-    adds up (`pairwise_consistency`).
-A slip
-    is an odometry factor that says anything, while the robot moved on as ever (`motion`); of all
-    of them one is expected to be; and one is a motion like no other, which is none. A gap, or the
-    seam of two sessions, is one whose place is known. The sides of it are right in themselves, so
-    the true loops across agree with each other. A slip is one explanation of loops that do not
-    fit, lies are the other: `slips` compares their odds, with half a gate for each place that one
-    of them calls a lie.
-A drift
-    is an error of all steps, the same on each metre: a third explanation, asked before slips. It
-    is taken where it makes the loops likelier (`drift`); of one learnt as noise residuals tell.
-A part
-    is what accepted factors tie together. Parts are joined where loops of two places agree.
-A doubt
-    is a rival explanation nearly as good as the one that won: `reasons` names it.
+1. Noise. What a file states of its noise may be off by a constant for each kind, odometry or
+   loops, and number: moves and turns, in space those of the floor and of the height apart. It is
+   found from the innovations of all loops (`gating.noise_variance`), then again from the
+   residuals of what is accepted (`rounds`).
+2. Rounds. A true loop has an innovation r with a covariance C by samples of the map
+   (`innovation`): r'C^-1 r passes the gate. A false one is uniform over the extent of the map
+   and all rotations. How many are false is found from the loops (empirical Bayes, `gating`).
+   What is accepted at one time is false with a probability of 1% at most; then the map is solved
+   anew, until nothing changes. Loops of one place (`places`) may be one mistake: together they
+   count once.
+3. Parts. What lies beyond a gap of the odometry is joined where loops of two places agree
+   (`pairwise_consistency`).
+4. Hypotheses. Where loops do not fit, the odometry drifts, the same on each metre (`drift`), a
+   step of it slipped (`slips`), or it is noisier for a run (`noisier`): each is taken where it
+   explains more than it costs, ln of odds. Then again from 2.
+5. Audit. Each place is predicted by all else (`audit`): what is clearly false goes, what is
+   refused and explains more than it costs comes in.
+6. Confidence. Each map that may be right in place of the one found, with its odds, and how
+   likely the one found is wrong then (`confidence`). Below 90% it is doubtful, and these are the
+   doubts.
 
-No loop is factored before it is accepted, so none bends what it is judged by. Read on in `rounds`,
-`gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `untold`, `cuts`, `slips`.
+No loop is factored before it is accepted, so none bends what it is judged by.
 """
 
 from collections.abc import Callable, Iterator
@@ -56,33 +41,36 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core import kernels
-from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.as_measured import FAILURES, Believed, OnRound, as_measured
-from l1slam_ros.core.robust.forecast import CONFIDENT, drift_taken_for_noise, right_within
-from l1slam_ros.core.robust.gating import log_odds_of_false, probability
-from l1slam_ros.core.robust.innovation import BY_CHANCE, chi2_quantile, covariances, spread_of
+from l1slam_ros.core.robust.audit import Places, alternatives, audit, places_of
+from l1slam_ros.core.robust.confidence import CONFIDENT, Alternative, Drawn, compared, drawn
+from l1slam_ros.core.robust.innovation import spread_of
 from l1slam_ros.core.robust.inspection import OFF_SCALE
 from l1slam_ros.core.robust.judgement import (
+    DRIFTS,
     NORM,
+    OTHER_MAP,
+    SLIP,
+    UNFINISHED,
     UNSOLVED,
+    WEAK,
     Doubt,
     Judgement,
     doubt_of,
     judgement_of,
-    listed,
     so_far,
 )
 from l1slam_ros.core.robust.odometry.cuts import join
 from l1slam_ros.core.robust.odometry.drift import Straight, likeliest, straightened
 from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
 from l1slam_ros.core.robust.odometry.noisier import with_runs
-from l1slam_ros.core.robust.odometry.slips import without_slip
-from l1slam_ros.core.robust.reasons import doubts
+from l1slam_ros.core.robust.odometry.slips import common_steps, without_slip
+from l1slam_ros.core.robust.pairwise_consistency import longest_run, spanned, strongest_group
+from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.robust.rounds.landmarks import with_landmarks
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
@@ -90,6 +78,8 @@ from l1slam_ros.core.solvers.gauss_newton import l2_map
 from l1slam_ros.core.solvers.nonlinear import Solution
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
 
+# As likely as not.
+_EVEN = 0.5
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
 
@@ -122,10 +112,12 @@ def robust_solve(
         for number, growth in enumerate(rounds(first, repair), 1):
             last = so_far(growth, repair.drift), growth.poses
             report(number, int(np.count_nonzero(growth.loops)))
-        growth, uncontested, sure = with_uncontested(growth)
-        unconfirmed = uncontested[:0] if sure >= CONFIDENT else uncontested
-        reasons = doubts(growth, number < _MOST_ROUNDS, repair.rival, unconfirmed)
-        return judgement_of(growth, reasons, repair.drift, repair.odds, sure), growth.poses
+        growth, places, others = audit(growth)
+        if repair.rival:
+            loops = np.flatnonzero(growth.loops)
+            others.append(Alternative(DRIFTS, loops, -repair.odds, detail=f'{-repair.rival:+.2g}'))
+        judgement = judged(growth, places, others, number < _MOST_ROUNDS)
+        return replace(judgement, drift=repair.drift), growth.poses
     except FAILURES as error:
         judgement, poses = known or last
         return judgement.broken_off(graph, error), poses
@@ -160,12 +152,9 @@ class _Repair:
         drifts = likely_drifts(self._graph).tolist() if asked else []
         if drifts:
             some = [stated, *(end for drift in drifts for end in self._without(drift))]
-            begun = None if len(stated.loops) else with_runs(found)
+            begun = None if len(stated.loops) else with_runs(found)[0]
             some += self._ends(0.0, begun) if begun else []
             best, self.rival, self.odds = likeliest(some)
-        taken = drift_taken_for_noise(as_stated) if best is stated else 0.0
-        if taken:
-            best = next((end for end in self._without(taken) if end.keeps_places(as_stated)), best)
         self.drift = best.drift
         return None if best is stated else best.found
 
@@ -181,7 +170,7 @@ class _Repair:
 
         def ended(*states: Growth) -> Growth | None:
             ends.append(Straight(drift, *states))
-            return None if len(ends[-1].loops) else with_runs(states[0])
+            return None if len(ends[-1].loops) else with_runs(states[0])[0]
 
         for _ in rounds(growth, ended):
             self._check()
@@ -216,7 +205,9 @@ def minimise_robustly(
         whole, seed = _least_squares(graph, judgement, poses, check)
         solution = minimise(whole, seed)
         check()
-        more = _norm_doubts(graph, judgement, whole, seed, solution.poses)
+        sure = _sure_of_norm(graph, judgement, whole, seed, solution.poses)
+        more = _norm_doubts(graph, judgement, sure)
+        judgement = replace(judgement, confidence=judgement.confidence * sure)
     except FAILURES as error:
         solution = _standing(judgement.believed(graph), poses)
         seed = poses
@@ -245,7 +236,8 @@ def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
         return ()
     try:
         whole, seed = _least_squares(graph, judgement, poses, check)
-        return _norm_doubts(graph, judgement, whole, seed, poses)
+        return _norm_doubts(graph, judgement,
+                            _sure_of_norm(graph, judgement, whole, seed, poses))
     except FAILURES as error:
         return (_unsolved(graph, judgement, error),)
 
@@ -257,40 +249,36 @@ def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,
     return whole, l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
 
 
-def _norm_doubts(graph: FactorGraph, judgement: Judgement, whole: FactorGraph, seed: Array,
-                 poses: Array) -> tuple[Doubt, ...]:
+def _sure_of_norm(graph: FactorGraph, judgement: Judgement, whole: FactorGraph, seed: Array,
+                  poses: Array) -> float:
     """
-    Return a doubt where half of a map, (n, p), is further off the L2 map than noise makes it.
+    Return how likely a map, (n, p), is right by what its norm makes of the accepted factors.
 
-    Of normal noise, as it was found, the difference has pi/2 - 1 of the covariance of the L2 map
-    at most, which is what L1 pays for it. Of the keyframes of one way all may err together. No
-    doubt where either map is right if the other one is.
+    Where these have normal noise, as it was found, the truth is about their L2 map.
 
     whole, seed : see `_least_squares`
     """
-    manifold = graph.manifold
-    other = manifold.positions(seed)
-    if absolute_trajectory_error(manifold.positions(poses), other) < right_within(other):
-        return ()
     noise = judgement.found_variance(graph)
     noise = np.concatenate((noise, np.ones(len(whole.between) - len(noise))))
-    spread = covariances(spread_of(whole, seed, cholesky_of(whole), noise))
-    step = manifold.local(seed, poses)[len(poses) - len(spread):]
-    square = kernels.prediction.normalise(spread, step)[0]
-    explained = (np.pi / 2 - 1) * chi2_quantile(1 - BY_CHANCE, np.array([manifold.TANGENT_SIZE]))
-    if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
+    samples = spread_of(whole, seed, cholesky_of(whole), noise)
+    samples = np.concatenate((np.zeros((len(seed) - len(samples), *samples.shape[1:])), samples))
+    some = compared(len(seed))
+    other = Drawn(graph.manifold, seed[some], samples[some], np.zeros_like(poses[some, 0], int))
+    return 1.0 - replace(other, poses=poses[some]).harm(other)
+
+
+def _norm_doubts(graph: FactorGraph, judgement: Judgement, sure: float) -> tuple[Doubt, ...]:
+    """Return the doubt of a map that its norm makes as likely wrong as right, or more so."""
+    if sure > _EVEN:
         return ()
-    loops = graph.between.pairs[judgement.accepted & ~graph.between.is_odometry]
-    return (Doubt(NORM, len(loops), 0, graph.n_poses - 1, pairs=listed(loops)),)
+    return (doubt_of(graph, judgement.accepted & ~graph.between.is_odometry, NORM),)
 
 
 def rounds(
     growth: Growth, repaired: Callable[[Growth, Growth], Growth | None] | None = None
 ) -> Iterator[Growth]:
     """
-    Yield the state after each round, until there is nothing more to accept but the noise's tail.
-
-    That comes in after the last one, into the state that was yielded last.
+    Yield the state after each round, until there is nothing more to accept.
 
     repaired : asked in the end for another state, from the one with the noise as it was found and
     the one where all may be as noisy as they say; None: there is none, or nobody looks for one.
@@ -314,34 +302,78 @@ def rounds(
                 growth = other
                 found = None
         yield growth
-    growth.accept_tail()
 
 
-def with_uncontested(growth: Growth) -> tuple[Growth, Indices, float]:
+def judged(growth: Growth, places: Places, others: list[Alternative], ended: bool = True
+           ) -> Judgement:
     """
-    Return a state with the loops that are left out, where all fit the map and each other.
+    Return what a state says of the factors that were given, and how sure that is.
 
-    Then nothing is an outlier but by the prior: few loops against uncertain odometry, which false
-    ones would fit as well. The likelier map has them. Also which they are, (k,), and how likely it
-    is that none is an outlier; a place may be one mistake, so it counts once.
+    others : maps that were tried beside it; ended : nothing more can be accepted
     """
+    graph, given = growth.given.graph, growth.given
+    map_ = drawn(growth)
+    others = others + alternatives(growth, places, others) + slips(growth) + agreeing(growth)
+    left_out = np.flatnonzero(given.is_loop & ~growth.accepted)
+    if len(left_out) and not growth.loops.any():  # nothing confirms the odometry
+        others.append(Alternative(WEAK, left_out, 0.0))
+    harms = np.array([one.chance * map_.harm(one.map) for one in others])
+    judgement = judgement_of(growth)
+    loops = given.is_loop[:given.size]
+    if loops.any():
+        judgement = replace(judgement, expected_error=map_.expected,
+                            confidence=float(np.prod(1 - harms)))
+    doubts = []
+    if not ended:
+        doubts.append(doubt_of(graph, left_out[left_out < given.size], UNFINISHED))
+    if judgement.confidence < CONFIDENT:
+        doubts += [doubt_about(growth, others[k]) for k in np.argsort(-harms, kind='stable')
+                   if harms[k] > (1 - CONFIDENT) / 2]
+        doubts = doubts or [doubt_about(growth, others[int(harms.argmax())])]
+    return replace(judgement, doubts=tuple(dict.fromkeys(doubts)))
+
+
+def doubt_about(growth: Growth, other: Alternative) -> Doubt:
+    """Return the doubt of a map that another one may be right in place of it."""
     given = growth.given
-    rows = np.flatnonzero(given.is_loop & ~growth.accepted)
-    if not len(rows) or growth.across()[rows].any() or (growth.cut & ~given.gap).any():
-        return growth, rows[:0], 1.0
-    found = growth.innovations(rows)
-    if (found.square >= given.gate(found.freedom)).any():
-        return growth, rows[:0], 1.0
-    state = growth.copy()
-    state.accepted[rows] = True
-    state.solve()
-    if not state.accepted[rows].all():
-        return growth, rows[:0], 1.0
-    log_ratio = found.log_ratio()
-    odds = log_odds_of_false(log_ratio, 0, int(np.count_nonzero(growth.loops)))
-    false = np.zeros(given.place[rows].max() + 1)
-    np.maximum.at(false, given.place[rows], probability(odds - log_ratio))
-    return state, rows, float(np.prod(1 - false))
+    doubt = doubt_of(given.graph, other.loops[other.loops < given.size], other.kind, other.detail)
+    if other.step >= 0:
+        doubt = replace(doubt, first=int(given.low[other.step]), last=int(given.high[other.step]))
+    return doubt
+
+
+def slips(growth: Growth) -> list[Alternative]:
+    """Return the maps where an odometry factor slipped that is not cut, or did not that is."""
+    given, found = growth.given, []
+    for step, odds in growth.slip_odds.items():
+        span = given.spanning(step)
+        across = growth.accepted & span
+        if across.any() and given.trusted[across].all():
+            continue  # a person says where the robot went
+        found.append(Alternative(SLIP, np.flatnonzero(across if across.any() else span),
+                                 -odds if growth.cut[step] else odds, step=step))
+    return found
+
+
+def agreeing(growth: Growth) -> list[Alternative]:
+    """
+    Return the map of refused loops of several places, or a long run, that agree with each other.
+
+    They span a step of the odometry that no accepted loop does, or a gap: the odometry slipped
+    there, or as many are lies that agree. Either is as likely.
+    """
+    given, rows = growth.given, growth.undecided()
+    group = strongest_group(growth, rows)
+    if given.count_places(group) < TWO_PLACES:
+        group = longest_run(growth, rows)
+    if not len(group):
+        return []
+    accepted = growth.loops
+    across = spanned(given.low[accepted], given.high[accepted], given.graph.n_poses)
+    steps = common_steps(growth, group)
+    if not ((across[given.low[steps]] == 0) | growth.cut[steps]).any():
+        return []
+    return [Alternative(OTHER_MAP, group, 0.0)]
 
 
 def judge(
@@ -364,7 +396,7 @@ def judge(
     try:
         first.resume(poses, known.accepted, known.variance_meant)
         *_, growth = rounds(first)
-        judgement = judgement_of(growth, doubts(growth), drift=known.drift)
+        judgement = replace(judged(growth, places_of(growth), []), drift=known.drift)
         units = known.variance / known.variance_meant
         return replace(judgement, variance=judgement.variance * units,
                        meant=known.meant), growth.poses

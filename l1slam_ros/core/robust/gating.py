@@ -32,15 +32,8 @@ from l1slam_ros.core.robust.innovation import (
 Gate = Callable[[Indices], Array]
 
 # Of factors that are believed at one time, any is false with at most this probability. Of 89 runs
-# (benchmarks/robust/SENSITIVITY.md, as all such counts) half makes 4 worse, double 2.
+# (benchmarks/robust/sensitivity.py, as all such counts) half makes 4 worse, double 2.
 DOUBT = 0.01
-# Of places of which many are believed at one time, no larger part is false than of true loops is
-# refused, where no more than two of three loops lie, ln of odds: with nine of ten, all of one
-# claim, sphere2500 kept lies. Where half lie, it takes as few rounds as without this.
-_MOST_LIE = np.log(2)
-# Where no more than this part of all are believed by themselves, others are for what they say
-# together, or a large map that is not sure of itself would grow by a loop or two a round.
-_FEW = 2e-3
 # The noise is judged by so many of the best predicted factors; half and double make none worse.
 _BEST_PREDICTED = 1000
 # What differs by no more than this part of it is the same: what rounds of expectation and
@@ -83,31 +76,27 @@ def probability(log_odds: Array) -> Array:
 
 def believable(
     found: Innovations, posterior: Posterior, gate: Gate, fits: Mask, believed: int,
-    place: Indices, beside: Array,
+    place: Indices,
 ) -> Indices:
     """
-    Return the factors that may be believed: each by itself, if these are few also together, (k,).
+    Return the factors that may be believed: each by itself, else together, (k,).
 
     Parameters
     ----------
     gate : what squares of true factors stay below, by their freedom; fits : (m,) which do
     believed : how many others are true for sure
-    place : (m,) see `places`; beside : (m,) what these say, see `beside_refused`
+    place : (m,) see `places`
 
     """
     log_ratio = found.log_ratio()
     odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), believed)
-    log_odds = np.logaddexp(
-        odds + beside, rivals(found, posterior, (fits, log_ratio, odds), place))
-    # Before any is believed, or by noise that is too large, lies fit nearly as well as true ones;
-    # where most lie, so many do that some fit well, and they agree more than by chance.
-    many = believed > 0 and odds < _MOST_LIE
-    well = (found.square < gate(found.freedom) / 2) & many
+    log_odds = np.logaddexp(odds, rivals(found, posterior, (fits, log_ratio, odds), place))
+    # Before any is believed, or by noise that is too large, lies fit nearly as well as true ones.
+    well = (found.square < gate(found.freedom) / 2) & (believed > 0)
     good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits], place[fits],
                                                  well[fits])]
-    if len(good) <= _FEW * len(fits):
-        more = together(found, posterior, gate, (fits, log_ratio, log_odds), place, len(good) > 0)
-        good = np.union1d(good, more)
+    if not len(good):
+        good = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
     return good
 
 
@@ -139,25 +128,18 @@ def at_once(log_odds: Array, place: Indices, well: Mask) -> Indices:
 
 
 def together(found: Innovations, posterior: Posterior, gate: Gate,
-             alone: tuple[Mask, Array, Array], place: Indices,
-             beside_sure: bool) -> Indices:
+             alone: tuple[Mask, Array, Array], place: Indices) -> Indices:
     """
-    Return which factors may be believed for what others say that fit, (k,).
+    Return which factors may be believed by pairs, where none is sure by itself, (k,).
 
-    The best factor b of another place speaks for a as far as a makes it likelier. If b is false
-    with the log odds o, what it says is 1 + exp(log ratio of b, o less) times as likely as chance;
-    if a is true, 1 + exp(log ratio of b given a, o less). Of their ratio the logarithm is added.
-
-    Where none is sure by itself, all of the log ratio of b given a is added, less o above 0: two
-    that fit well begin a map though each may be chance. By the former alone wheels of a recorded
-    log, FR079, end 1.0 m off for .7; by the latter alone a sure factor would vouch for any.
+    To the log ratio of a that of the best factor b of another place given a is added, less the
+    log odds of b above 0: two that fit well begin a map though each may be chance.
 
     Parameters
     ----------
     gate : what squares of true factors stay below, by their freedom
     alone : which fit (m,), the log ratios and the log odds (m,)
     place : (m,) see `places`
-    beside_sure : whether some are believed by themselves
 
     """
     fits, log_ratio, odds = alone
@@ -165,9 +147,6 @@ def together(found: Innovations, posterior: Posterior, gate: Gate,
     far = np.zeros(len(fits))
     agree = square < gate(found.freedom[one] + found.freedom[other])
     gain = both - log_ratio[one] - np.maximum(odds[other], 0.0)
-    if beside_sure:
-        gain = (np.logaddexp(0.0, both - log_ratio[one] - odds[other])
-                - np.logaddexp(0.0, log_ratio[other] - odds[other]))
     np.maximum.at(far, one[agree], gain[agree])
     believed: Indices = np.flatnonzero(
         (log_ratio + far > odds + np.log(1 / DOUBT - 1)) & (far > 0))

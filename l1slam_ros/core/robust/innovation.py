@@ -118,10 +118,12 @@ def spread_of(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     """
     Return samples of the error of the L2 map (n, p) of a graph, (free keyframes, k, q).
 
-    variance : (m,) of the noise that there is, in units of what each factor states
+    variance : (m,), or (m, k) of its numbers, of the noise that there is, in units of what each
+    factor states
     """
     system = factorised(graph, poses, cholesky)
-    noisy = replace(system, blocks=system.blocks * np.sqrt(variance)[:, None, None, None])
+    roots = np.sqrt(np.atleast_2d(variance.T).T)[:, None, :, None]
+    noisy = replace(system, blocks=system.blocks * roots)
     return _steps(graph, noisy, cholesky)[1][:-1]
 
 
@@ -155,14 +157,14 @@ def _steps(graph: FactorGraph, system: LinearSystem,
 
 
 def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,
-                         freedom: Indices, k: int) -> Array:
+                         freedom: Indices, k: int, tail: int = TAIL) -> Array:
     """
     Return ln p(residual) + ln(volume of a false one's), (m,); freedom : (m,) of the residuals.
 
-    p is Student's, with `TAIL` degrees of freedom for each of the k numbers of a step: what a
+    p is Student's, with `tail` degrees of freedom for each of the k numbers of a step: what a
     covariance from as many samples says of one more (Jeffreys' prior).
     """
-    q = TAIL * k
+    q = tail * k
     constant = by_freedom(lambda size: lgamma((q + 1) / 2) - lgamma((q + 1 - size) / 2)
                           - size * np.log(np.pi * q) / 2, freedom)
     density = constant - (log_det + (q + 1) * np.log1p(square / q)) / 2

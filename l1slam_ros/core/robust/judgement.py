@@ -23,20 +23,17 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.parts import part_labels
-from l1slam_ros.core.robust.forecast import CONFIDENT, forecast, right_within, terms_of, unsureness
-from l1slam_ros.core.robust.gating import probability
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.pairwise_consistency import RUN
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds.growth import Growth
 
 # Kinds of doubts, each with what it means.
-WEAK = 'a weak map'  # it expects a large error of itself, or no loop is accepted
-UNCONFIRMED = 'unconfirmed loops'  # odometry alone hardly confirms the accepted ones
-ONE_JOINS = 'one place joins'  # loops of one place alone join two parts
-OTHER_MAP = 'another map'  # refused loops agree on it, and no accepted one contradicts them
-SLIP = 'a slip suspected'  # an odometry factor may have slipped
-DRIFTS = 'a drift suspected'  # the odometry drifts, which was taken for noise
+WEAK = 'a weak map'  # no loop is accepted
+UNCONFIRMED = 'unconfirmed loops'  # accepted ones that all else hardly confirms
+OTHER_MAP = 'another map'  # that refused loops may be right about
+SLIP = 'a slip suspected'  # an odometry factor may have slipped, or not
+DRIFTS = 'a drift suspected'  # the odometry may drift otherwise
 UNFINISHED = 'not at an end'  # there were more rounds to come
 NORM = 'another norm'  # the same factors have another map in another norm
 NO_WHEELS = 'no wheels'  # scans alone show the motion
@@ -77,8 +74,8 @@ class Judgement:
     same units; slips : (k,) the odometry factors that slipped, not accepted; doubts : reasons not
     to rely on the map; settled : no more is to be found out from the factors that are there; drift
     : by how much more each metre of the odometry turns than it says [rad/m]; confidence : see
-    `forecast`, NaN where nothing is recorded of such maps; terms : what that was made of, see
-    `forecast`; is_refusal_doubted : refused loops may be true; meant : (2, k) the variance of each
+    `confidence`, NaN of a graph without loops; expected_error : of the map by its posterior [m];
+    is_refusal_doubted : refused loops may be true; meant : (2, k) the variance of each
     number of odometry and of loops, where nobody stated it, in units of what is stated.
     """
 
@@ -92,7 +89,7 @@ class Judgement:
     settled: bool = True
     drift: float = 0.0
     confidence: float = float('nan')
-    terms: Array = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
+    expected_error: float = 0.0
     is_refusal_doubted: bool = False
     meant: Array = field(default_factory=lambda: np.ones((2, 1)), compare=False, repr=False)
 
@@ -245,46 +242,17 @@ def so_far(growth: Growth, drift: float = 0.0) -> Judgement:
                      drift=drift)
 
 
-def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (), drift: float = 0.0,
-                 odds: float = np.inf, sure: float = 1.0) -> Judgement:
-    """
-    Return what a state says of the factors that were given.
-
-    That another drift may be right is no reason where maps that looked like this one were right,
-    nor where none is taken that is the likelier by far.
-
-    drift : that of the odometry [rad/m]; odds : ln of those of it against all others; sure : how
-    likely it is that no loop is an outlier of those that nothing else confirms
-    """
-    believed = so_far(growth, drift)
+def judgement_of(growth: Growth) -> Judgement:
+    """Return what a state says of the factors that were given."""
+    believed = so_far(growth)
     square, suspect = fits(growth)
     given = growth.given
     size = given.size
     loops = given.is_loop[:size]
-    unsure = unsureness(growth)
-    chance = float(probability(np.array(odds)))
-    if not drift and np.isfinite(odds) and chance >= CONFIDENT:
-        reasons = tuple(doubt for doubt in reasons if doubt.kind != DRIFTS)
-    kinds = {doubt.kind for doubt in reasons}
-    accepts_any = bool(growth.loops.any())
-    terms = terms_of(accepts_any, unsure,
-                     *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
-    confidence = forecast(terms) if loops.any() else float('nan')
-    if odds < 0:
-        confidence = min(confidence, chance)
-    confidence *= sure
-    reasons = tuple(
-        doubt for doubt in reasons if doubt.kind != DRIFTS or not confidence >= CONFIDENT)
-    left_out = np.flatnonzero(loops & ~believed.accepted)
-    noise = _noise(growth)[:size]
-    if not reasons and confidence < CONFIDENT:
-        metres = unsure * right_within(given.graph.manifold.positions(growth.poses))
-        reasons += (doubt_of(given.graph, left_out, WEAK, f'{metres:.2g}' * accepts_any),)
-    doubted = OTHER_MAP in kinds or bool(
-        2 * len(left_out) > np.count_nonzero(loops) >= RUN)
+    left_out = np.count_nonzero(loops & ~believed.accepted)
+    doubted = bool(2 * left_out > np.count_nonzero(loops) >= RUN)
     return replace(believed, suspect=suspect[:size], sigmas=np.sqrt(square[:size]),
-                   noise=noise, doubts=reasons, confidence=confidence, terms=terms,
-                   is_refusal_doubted=doubted)
+                   noise=_noise(growth)[:size], is_refusal_doubted=doubted)
 
 
 def _noise(growth: Growth) -> Array:

@@ -18,7 +18,6 @@ each other, and whether the loops of a place err together.
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.geometry.quantiles import gamma_quantile
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest_of_components
 from l1slam_ros.core.graph.linear_system import with_world
@@ -120,22 +119,6 @@ def mates(place: Indices, ends: Array) -> tuple[Indices, Indices]:
     same = place[one] == place[other]
     one, other = one[same], other[same]
     return np.concatenate((one, other)), np.concatenate((other, one))
-
-
-def beside_refused(pairs: tuple[Indices, Indices], refused: Mask, true: Mask) -> Array:
-    """
-    Return what the other loops of its place speak against each factor, ln of odds, (m,).
-
-    How much likelier it is that most of them are refused if it is false than if it is true, by how
-    often that is so of those that are refused, and of the true ones; see `mates`.
-    """
-    one, other = pairs
-    count, against = (np.bincount(one, weights, len(refused))
-                      for weights in (None, refused[other]))
-    beside = against > count / 2
-    of_false, of_true = ((np.count_nonzero(beside & some) + 1)
-                         / (np.count_nonzero((count > 0) & some) + 1) for some in (refused, true))
-    return np.where(beside, max(float(np.log(of_false / of_true)), 0.0), 0.0)
 
 
 def _cells(corners: Array) -> tuple[Array, Indices]:

@@ -186,7 +186,10 @@ def _read(path: Path) -> SavedMap:
         doubts = tuple(
             Doubt(**doubt | {'pairs': tuple((i, j) for i, j in doubt.get('pairs', ()))})
             for doubt in values['doubts'])
-        judgement = _restored(Judgement.nothing(), values | {'doubts': doubts})
+        # One variance for all numbers, or one for each.
+        each = np.ones((2, max(np.size(values.get('meant', 1.0)) // 2, 1)))
+        judgement = _restored(replace(Judgement.nothing(), meant=each),
+                              values | {'doubts': doubts})
         saved = SavedMap(restored(state, values), _restored(optimised, values), judgement,
                          values['robust'], robots=tuple(values.get('robots', ())))
         _require_within((*limits_of(saved.builder), *_limits(saved)))

@@ -21,7 +21,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
 from l1slam_ros.core.graph.spanning_tree import pair_key, parents
 from l1slam_ros.core.robust.innovation import claimed_volume
-from l1slam_ros.core.robust.odometry.motion import Motion, log_odds_of_slips, steps_of, unwhitening
+from l1slam_ros.core.robust.odometry.motion import Motion, steps_of, unwhitening
 from l1slam_ros.core.robust.odometry.untold import log_slip
 from l1slam_ros.core.robust.pairwise_consistency import spanned, strongest_across
 from l1slam_ros.core.robust.rounds.growth import Growth
@@ -203,19 +203,6 @@ def _cut_at(state: Growth, cut: int, step: int) -> Growth:
     return state
 
 
-def put_back(state: Growth, motion: Motion) -> Growth:
-    """Return the state where steps say what they measured, where that fits."""
-    steps = np.flatnonzero(state.cut & ~state.given.gap)
-    found = state.uncut().innovations(steps)
-    fits = ((log_odds_of_slips(state, motion)[steps] <= 0)
-            & (found.square < state.given.gate(found.freedom)))
-    if fits.any():
-        state = state.copy()
-        state.cut[steps[fits]] = False
-        state.solve()
-    return state
-
-
 def unusual(state: Growth, motion: Motion) -> Indices:
     """
     Return the steps that are cut where the robot, repaired, does not move as elsewhere, (k,).
@@ -225,7 +212,7 @@ def unusual(state: Growth, motion: Motion) -> Indices:
     """
     gate = state.given.gate(np.array([len(motion.mean)]))[0]
     # All may be as noisy as they turn out, or as they say.
-    said = state.noise.word[0] / state.noise.variance[0]
+    said = state.noise.said[0]
     found = []
     for cut in np.flatnonzero(state.cut & ~state.given.gap).tolist():
         row = np.array([cut])

@@ -18,7 +18,7 @@ more, so a map is made by each: the one by which the loops are likeliest is take
 one is nearly as likely, the map is doubtful.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -107,17 +107,6 @@ class Straight:
             _log_likelihood(growth, self._one_each) + len(self._one_each) * self.log_room
             - alone * np.log(len(growth.given.factors)) - ((self.drift / USUAL)**2 + known) / 2)
 
-    def fits(self, loops: Indices) -> tuple[float, int]:
-        """Return the ln of how likely the others of its places are among some, and their count."""
-        others = np.setdiff1d(np.intersect1d(loops, self.loops), self._one_each)
-        if not len(others):
-            return 0.0, 0
-        growth = self.told.copy()
-        growth.noise = replace(growth.noise, at_their_word=False)
-        both = np.union1d(others, self._one_each)
-        return (_log_likelihood(growth, both) - _log_likelihood(growth, self._one_each),
-                len(others))
-
     @cached_property
     def stretches(self) -> float:
         """Along how many stretches more than places loops are."""
@@ -126,12 +115,6 @@ class Straight:
         near = np.bincount(one, loops[other], len(loops))[loops]
         return float((1 / (1 + near)).sum()) - len(self._one_each)
 
-    def keeps_places(self, as_stated: Growth) -> bool:
-        """Return whether loops of as many places are accepted as without."""
-        now, before = (as_stated.given.count_places(state.loops)
-                       for state in (self.told, as_stated))
-        return now >= before
-
     @cached_property
     def _one_each(self) -> Indices:
         place = self.told.given.place[self.loops]
@@ -139,7 +122,7 @@ class Straight:
 
     @cached_property
     def loops(self) -> Indices:
-        """The loops that were accepted before the tail of the noise, (k,)."""
+        """The loops that are accepted, (k,)."""
         return np.asarray(np.flatnonzero(self.told.loops))
 
 
@@ -150,9 +133,7 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
     The rival is 0 [rad/m] where there is none; the odds are those against all rivals together.
 
     The first one is that without a drift. Where it explains loops, too, another has to be likelier
-    by what two places are worth, by all loops of each, which agree, be it a mistake or not: where
-    those of the first one are of one place, by one of each, too. And it has to leave the odometry
-    no noisier, as it would be if lies came in by chance.
+    by what two places are worth, and a rival of a drift is less likely by no more than that.
 
     The longer a place is, the larger is the map: on a smaller one there would be more such places
     than loops were found at.
@@ -161,21 +142,12 @@ def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
     values = np.array([straight.log_evidence + straight.stretches * (straight.log_room - widest)
                        for straight in some])
     sure = TWO_PLACES * some[0].told.given.log_odds_of_place
-    stated = len(some[0].loops) > 0
-    first = 0 if stated else int(np.argmax(values))
-    fits, count = np.array([straight.fits(some[first].loops) for straight in some]).T
-    fitting = values + fits - count * fits[first] / max(count[first], 1)
-    if stated:
-        noise = np.array([straight.told.noise.variance[0] for straight in some])
-        alone = some[0].told.given.count_places(some[0].loops) < TWO_PLACES
-        fitting[(alone & (values < values[0])) | (noise > noise[0])] = -np.inf
-        fitting[0] += sure
-        values, first = fitting, int(np.argmax(fitting))
-    # Either way a rival is less likely by no more than two places are worth.
+    if len(some[0].loops):
+        values[0] += sure
+    first = int(np.argmax(values))
     less = values[first] - values
     rivals = [(less[k], other.drift - some[first].drift) for k, other in enumerate(some)
-              if max(less[k], fitting[first] - fitting[k]) < sure
-              and k and len(other.loops) and other.drift != some[first].drift]
+              if less[k] < sure and k and len(other.loops) and other.drift != some[first].drift]
     if not first or not rivals:
         return some[first], 0.0, np.inf
     return some[first], min(rivals)[1], -float(np.logaddexp.reduce([-less for less, _ in rivals]))
@@ -200,19 +172,8 @@ def _log_likelihood(growth: Growth, loops: Indices) -> float:
 
 def drift_information(growth: Growth) -> float:
     """Return what a map says of the drift of its odometry, as the inverse of a variance."""
-    rows, turn = _turns(growth)
+    accepted = np.flatnonzero(growth.accepted)
+    rows = np.flatnonzero(~(growth.given.is_loop | growth.cut)[accepted])
+    turn = drift_turn(growth.given.factors, accepted[rows]) / np.sqrt(growth.noise.assumed[0])
     by_noise = np.einsum('mi,miq->q', turn, growth.posterior.left_over(rows))
     return float((by_noise**2).mean())
-
-
-def drift_left(growth: Growth) -> float:
-    """Return what the residuals say of the drift that is left in a map, times its information."""
-    rows, turn = _turns(growth)
-    return float((turn * growth.posterior.residual[rows]).sum())
-
-
-def _turns(growth: Growth) -> tuple[Indices, Array]:
-    """Return the odometry among what is accepted, (k,), and its `drift_turn`, as it is weighed."""
-    rows = np.flatnonzero(growth.accepted)
-    at = np.flatnonzero(~(growth.given.is_loop | growth.cut)[rows])
-    return at, drift_turn(growth.given.factors, rows[at]) / np.sqrt(growth.noise.assumed[0])

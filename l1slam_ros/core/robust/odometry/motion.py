@@ -134,7 +134,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     square, log_det = kernels.prediction.normalise(inverse.copy(), innovation[:, :, 0])
     # All may be as noisy as they turn out, or as they say.
     found = max((r[~cut] ** 2).sum() / np.trace(R[~cut], axis1=1, axis2=2).sum(), 1.0)
-    said = growth.noise.word[0] / growth.noise.variance[0]
+    said = growth.noise.said[0]
     fit = np.max([log_likelihood_ratio(square / noise, log_det + k * np.log(noise),
                                        np.zeros(1), factors.freedom[rows], k)
                   for noise in (found, said)], axis=0) - np.linalg.slogdet(root)[1]

@@ -24,7 +24,7 @@ from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 FAR_NOISIER = 30.0
 
 
-def with_runs(growth: Growth) -> Growth | None:
+def with_runs(growth: Growth) -> tuple[Growth | None, float]:
     """
     Return a state with the runs that are left out and noisier odometry explains, None: without.
 
@@ -38,14 +38,14 @@ def with_runs(growth: Growth) -> Growth | None:
     most = np.unique(given.place[rows], return_counts=True)[1].max(initial=0)
     if most < RUN or growth.ventured.any() or (
             loops.any() and given.may_err_as_one(np.flatnonzero(loops))):
-        return None
+        return None, 0.0
     noisier = growth.copy()
     noisier.noise = replace(noise, variance=noise.variance * (FAR_NOISIER, 1.0))
     noisier.solve()
     found = noisier.innovations(rows)
     groups = runs(growth, rows[found.square < given.gate(found.freedom)])
     if not groups:
-        return None
+        return None, 0.0
     state = growth.copy()
     for group in groups:
         state.accepted[group] = state.ventured[group] = True
@@ -53,8 +53,8 @@ def with_runs(growth: Growth) -> Growth | None:
     state.drops[:] = 0
     state.learn_noise_anew()
     state.accept_more()
-    won = gain_of_places(growth, growth, state)
-    return state if won > max(_noisier_costs(growth, state), 0.0) else None
+    odds = gain_of_places(growth, growth, state) - max(_noisier_costs(growth, state), 0.0)
+    return (state, odds) if odds > 0 else (None, odds)
 
 
 def _noisier_costs(growth: Growth, noisier: Growth) -> float:

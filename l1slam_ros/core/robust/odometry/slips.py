@@ -16,8 +16,7 @@ the loops across are asked anew (`cuts`), and the rounds go on from there. To th
 gate for each place that is won and that nothing else explains, less one for each that is lost; of
 the loop that alone shows a slip, what it shows. A slip is believed if that makes it likelier than
 not. Loops do not make a robot jump: the slip repaired, it has to move as at some other step, or
-rather so than as measured. What fits the loops that came in without it did not slip: a lie, or
-another slip, had bent the map.
+rather so than as measured.
 """
 
 from collections.abc import Iterator
@@ -31,7 +30,6 @@ from l1slam_ros.core.robust.inspection import FEWEST
 from l1slam_ros.core.robust.odometry.cuts import (
     as_shown,
     odds_as_shown,
-    put_back,
     settled,
     unusual,
     without,
@@ -47,10 +45,9 @@ from l1slam_ros.core.robust.odometry.untold import (
     Shown,
     prior_of_slip,
     shown_slips,
-    untold_slip,
 )
 from l1slam_ros.core.robust.pairwise_consistency import gain_of, spanned
-from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
+from l1slam_ros.core.robust.rounds.growth import Growth
 
 # A step that may have slipped, the state without it and others, and what that costs, ln of odds.
 Attempt = tuple[int, Growth | None, float]
@@ -82,17 +79,22 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     for attempts in (_as_shown(growth, motion, likely), _tried(growth, as_stated, motion),
                      *(_as_shown(growth, motion, [one])
                        for one in told[len(likely):len(likely) + _TRIED])):
-        if found := _best(growth, as_stated, motion, odds, attempts):
-            return found
-    found = with_runs(growth)
-    if not found:
-        growth.slip_odds |= _odds_in_the_end(growth, motion, untold_slip(as_stated, shown))
+        found, most = _best(growth, as_stated, motion, odds, attempts)
+        if found:
+            break
+    runs, gain = with_runs(growth)
+    if runs and gain > most:
+        found = runs
     return found
 
 
 def _best(growth: Growth, as_stated: Growth, motion: Motion, odds: Array,
-          attempts: Iterator[Attempt]) -> Growth | None:
-    """Return the state that is the likeliest of some, None: the one before is, see `_tried`."""
+          attempts: Iterator[Attempt]) -> tuple[Growth | None, float]:
+    """
+    Return the state that is the likeliest of some and ln of its odds against the one before.
+
+    None: that one is likelier, see `_tried`.
+    """
     found, most = None, 0.0
     tried: dict[bytes, int] = {}
     for step, state, costs in attempts:
@@ -120,7 +122,7 @@ def _best(growth: Growth, as_stated: Growth, motion: Motion, odds: Array,
         if evidence > most and (usual or (odds[steps] > 0).all()):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps.tolist(), evidence))
-    return found
+    return found, most
 
 
 def _told(growth: Growth, shown: Shown) -> list[Told]:
@@ -150,7 +152,7 @@ def _as_shown(growth: Growth, motion: Motion, told: list[Told]) -> Iterator[Atte
         if state:
             # One loop that is hardly likely says nothing but what slipped.
             costs = growth.given.log_odds_of_place if some[0][2] <= -SURE else 0.0
-            yield some[0][0], put_back(settled(state, motion), motion), costs
+            yield some[0][0], settled(state, motion), costs
 
 
 def _odds_as_shown(growth: Growth, as_stated: Growth, state: Growth, motion: Motion) -> float:
@@ -190,57 +192,14 @@ def _odds_of_cuts(growth: Growth, state: Growth, motion: Motion, odds: Array, us
     return own
 
 
-def _odds_in_the_end(growth: Growth, motion: Motion, untold: dict[int, float]
-                     ) -> dict[int, float]:
-    """Return ln of the odds to have slipped of steps that are cut, or of which no loop tells."""
-    last = {step: max(odds, growth.slip_odds.get(step, odds))
-            for step, odds in untold.items() if odds > LEAST}
-    if growth.cut.any():
-        # More is known than when it was cut, unless that is what a lie would tell.
-        now = log_odds_of_slips(growth, motion)
-        last |= {step: float(now[step]) for step in growth.slip_odds
-                 if growth.cut[step] and not _is_lie_likelier(growth, step, motion)}
-    return last
-
-
-def _is_lie_likelier(growth: Growth, step: int, motion: Motion) -> bool:
-    """Return whether the loops of one place alone tell of a cut, and likelier lie than not."""
-    given = growth.given
-    loops = np.flatnonzero(growth.accepted & given.is_loop & given.spanning(step))
-    if len(np.unique(given.place[loops])) > 1:
-        return False
-    shown = odds_as_shown(growth, np.array([step]), motion) + prior_of_slip(growth)
-    return shown < 0
-
-
-def _tried(growth: Growth, as_stated: Growth, motion: Motion, after: bool | None = None
-           ) -> Iterator[Attempt]:
-    """
-    Yield steps that are cut, and the state without them.
-
-    None: it falls apart. Where the robot, repaired, does not move as elsewhere, a second step
-    bends what the loops across the first one say: the likeliest are tried, however unlikely each
-    is by itself. Where it does, and the loops say too little, only one that would be suspected
-    now.
-
-    after : whether the first step that was cut is usual; None: this one is the first
-    """
+def _tried(growth: Growth, as_stated: Growth, motion: Motion) -> Iterator[Attempt]:
+    """Yield steps that are cut, and the state without them; None: it falls apart."""
     odds, left_out = log_odds_of_slips(growth, motion), as_stated.undecided()
     # Where loops are left out, one more place may be won.
-    most = max(SURE, growth.given.log_odds_of_place) if len(left_out) else SURE
-    least = most if after is None else SURE if after else np.inf
-    for step in _suspected(growth, odds, left_out[:0] if after else left_out, least):
+    least = max(SURE, growth.given.log_odds_of_place) if len(left_out) else SURE
+    for step in _suspected(growth, odds, left_out, least):
         state = without(growth, step)
-        if not state:
-            yield step, None, 0.0
-            continue
-        state = settled(state, motion)
-        yield step, put_back(state, motion), 0.0
-        usual = not len(unusual(state, motion))
-        won = gain_of_places(growth, as_stated, state)
-        if after is None and (not usual or odds[step] + won <= 0):
-            yield from ((step, both, 0.0)
-                        for _, both, _ in _tried(state, state, motion, usual) if both)
+        yield step, state and settled(state, motion), 0.0
 
 
 def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> list[int]:

@@ -7,12 +7,12 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Slips of which no accepted loop tells: a loop that is refused is a lie, or shows one.
+Slips that refused loops show: such a loop is a lie, or true, and a step slipped.
 
-In: the end of a robust solve. Out: the step that slipped most likely, and the odds of that. Where
-few loops are, one that does not fit may be all the evidence of a slip. A lie claims anything, a
-slip explains any loop; but of a slip the loop says how the robot moved on, and of nearly all lies
-it would be a motion as it never makes.
+In: the end of a robust solve. Out: of each loop and step the odds of that. Where few loops are,
+one that does not fit may be all the evidence of a slip. A lie claims anything, a slip explains any
+loop; but of a slip the loop says how the robot moved on, and of nearly all lies it would be a
+motion as it never makes.
 """
 
 from math import lgamma
@@ -20,7 +20,7 @@ from math import lgamma
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.robust.forecast import CONFIDENT
+from l1slam_ros.core.robust.confidence import CONFIDENT
 from l1slam_ros.core.robust.innovation import claimed_volume
 from l1slam_ros.core.robust.odometry.motion import Motion, steps_of, unwhitening
 from l1slam_ros.core.robust.pairwise_consistency import asked, spanned
@@ -33,24 +33,6 @@ LEAST = float(np.log(1 / CONFIDENT - 1))
 Shown = tuple[Indices, Indices, Array]
 # Pairs of a loop and a step that are looked at together.
 _PAIRS = 20_000
-
-
-def untold_slip(growth: Growth, shown: Shown) -> dict[int, float]:
-    """
-    Return ln of the odds that a step slipped of which no accepted loop tells, by the step.
-
-    Of all such steps together, by the likeliest one; {}: there is none, or nothing is refused.
-    shown : see `shown_slips`
-    """
-    given = growth.given
-    _, steps, odds = shown
-    loops = growth.accepted & given.is_loop
-    across = spanned(given.low[loops], given.high[loops], given.graph.n_poses)
-    untold = across[given.low[steps]] == 0
-    if not len(odds) or not untold.any():
-        return {}
-    by_step = np.logaddexp.reduce(odds[:, untold], axis=0)
-    return {int(steps[untold][np.argmax(by_step)]): float(np.logaddexp.reduce(by_step))}
 
 
 def shown_slips(growth: Growth, motion: Motion) -> Shown:

@@ -23,9 +23,8 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.robust.gating import DOUBT, TINY, believable, noise_variance
+from l1slam_ros.core.robust.gating import DOUBT, SAME, TINY, believable, noise_variance
 from l1slam_ros.core.robust.innovation import (
-    BY_CHANCE,
     CHECKED,
     LEAST_RATIO,
     Innovations,
@@ -36,7 +35,7 @@ from l1slam_ros.core.robust.innovation import (
     sample_posterior,
 )
 from l1slam_ros.core.robust.inspection import FEWEST, OFF_SCALE, parallel_factors
-from l1slam_ros.core.robust.places import beside_refused, first_told
+from l1slam_ros.core.robust.places import first_told
 from l1slam_ros.core.robust.rounds.evidence import evidence_of
 from l1slam_ros.core.robust.rounds.noise import Noise
 from l1slam_ros.core.solvers.block_cholesky import with_pattern
@@ -46,6 +45,10 @@ from l1slam_ros.core.solvers.gauss_newton import ChangingOrder, l2_optimum
 _CHANCES = 2
 # So often noise is learnt anew of other factors: each time half of what it was before may stay.
 _LEARNT_ANEW = 8
+# Numbers of a step that have one variance, in units of what is stated: moves and turns; in space
+# those of the floor and of the height apart.
+_GROUPS = {3: (slice(0, 2), slice(2, 3)),
+           6: (slice(0, 2), slice(2, 3), slice(3, 5), slice(5, 6))}
 # While driving so many of the last absolute factors are looked at, with their neighbours.
 _LATEST = 50
 
@@ -59,8 +62,8 @@ class Growth:
     poses : (n, p) the L2 map of the accepted; posterior : of these; noise : as it was found;
     slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
     ventured : (m,) bool, loops of runs that noisier odometry explained; drops : (m,) how often
-    each was accepted and did not fit; fits_found : (m,) bool, not the loops that do not fit by the
-    noise that was found; check : called before long steps, raises where the work shall stop.
+    each was accepted and did not fit; check : called before long steps, raises where the work
+    shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -70,13 +73,12 @@ class Growth:
         self.accepted: Mask = ~given.is_loop | given.trusted
         self.poses = placed(given.graph.subset(self.accepted), given.chain)
         self.part = np.zeros(graph.n_poses, np.int64)
-        self.noise = Noise.of(given.stated)
+        self.noise = Noise.of(given.stated, given.graph.manifold.TANGENT_SIZE)
         self.posterior: Posterior
         self._order: ChangingOrder | None = None
         self.slip_odds: dict[int, float] = {}
         none = np.zeros(len(given.factors), bool)
         self.ventured = none
-        self.fits_found = ~none
         self.drops = none.astype(np.int64)
 
     def begin(self) -> None:
@@ -163,24 +165,20 @@ class Growth:
     def subgraph(self, rows: Indices) -> FactorGraph:
         """Return the graph of some factors, with the noise as it was found."""
         self._check()  # with this, each long step begins
-        variance = np.where(self.given.factors.is_absolute[rows], 1.0,
+        variance = np.where(self.given.factors.is_absolute[rows, None], 1.0,
                             self.noise.assumed[self.given.is_loop[rows].astype(np.int64)])
         cut = self.cut[rows]
         # Where loops hold both sides, they alone decide, be it to some hundred sigmas; where
         # nothing does, it is all there is. Either way the keyframes are where they are.
         low, high = self.given.factors.i[rows[cut]], self.given.factors.j[rows[cut]]
-        variance[cut] *= np.where(self.part[low] == self.part[high], 1 / TINY, 1.0)
+        variance[cut] *= np.where(self.part[low] == self.part[high], 1 / TINY, 1.0)[:, None]
         subgraph = self.given.graph.subset(rows, variance)
         subgraph.between.measurement[cut] = self.given.graph.manifold.between(
             self.poses[low], self.poses[high])
         return subgraph
 
     def take_at_their_word(self) -> None:
-        """From now on let factors be as noisy as they say; loops, that fit by what was found."""
-        rows = self._open(self.may_be_predicted & ~self.across() & ~self.given.factors.is_absolute)
-        if self.noise.word[1] > self.noise.variance[1]:  # else loops say no more than was found
-            found = self.innovations(rows)
-            self.fits_found[rows] = found.square < self.given.gate(found.freedom)
+        """From now on let factors be as noisy as they say."""
         self.noise = replace(self.noise, at_their_word=True)
         self.drops[:] = 0
 
@@ -210,36 +208,14 @@ class Growth:
             self.accepted[news] = True
             self.solve()
 
-    def accept_tail(self) -> None:
-        """
-        Accept loops that fit as they say, though not by the noise found, where they stand apart.
-
-        They are the tail of the noise, or lies that are not far off. Lies of a corridor are off by
-        anything along it: that the n nearest ones, those beside others not counted, are within
-        the part c of how far the next one is off, has the probability c^n. Nor is it further off
-        than one in a hundred of those that the gate refuses.
-        """
-        given = self.given
-        rows = np.flatnonzero(~self.fits_found & ~self.accepted)
-        found = self.innovations(rows)
-        off = found.square / given.gate(found.freedom)
-        order = np.argsort(off, kind='stable')
-        rank = np.full(len(given.factors), len(rows))
-        rank[rows[order]] = np.arange(len(rows))
-        one, other = given.mates
-        count = np.cumsum(~np.isin(rows[order], one[rank[other] < rank[one]]))
-        apart = np.diff(np.log(off[order]), append=np.inf) / 2 * count > np.log(1 / DOUBT)
-        apart &= (found.square < given.gate(found.freedom, BY_CHANCE * DOUBT))[order]
-        tail = rows[order[:np.flatnonzero(apart).max(initial=-1) + 1]]
-        if len(tail):
-            self.fits_found[tail] = True
-            self.accept_more()
-
     def learn_noise_anew(self) -> None:
-        """Solve, and learn the noise of what is accepted now alone, again and again."""
+        """Solve, and learn the noise of what is accepted now alone, until it is what it was."""
         for _ in range(_LEARNT_ANEW):
+            before = self.noise.variance
             self.noise = self.noise.forgotten()
             self.solve()
+            if np.allclose(self.noise.variance, before, rtol=SAME, atol=0.0):
+                break
 
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
@@ -295,15 +271,22 @@ class Growth:
 
     def _learn_noise(self, rows: Indices) -> None:
         """
-        Compare the residuals with what the noise makes of them, for odometry and for loops.
+        Compare the residuals with what the noise makes of them, for each number of either kind.
 
         Absolute factors are as noisy as they say: of theirs a few tell nothing.
         """
-        kind, known = self.given.is_loop[rows], FEWEST * self.given.graph.manifold.TANGENT_SIZE
-        own = np.where(self.given.factors.is_absolute[rows], 0.0, 1.0)
-        found = np.bincount(kind, own * (self.posterior.residual**2).sum(axis=1), 2)
-        stated = np.bincount(kind, own * np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
-        self.noise = self.noise.learnt((found + known) / (stated + known), self.accepted)
+        kind, k = self.given.is_loop[rows].astype(np.int64), self.given.graph.manifold.TANGENT_SIZE
+        own = ~self.given.factors.is_absolute[rows]
+        found, stated = np.zeros((2, 2, k))
+        np.add.at(found, kind[own], self.posterior.residual[own]**2)
+        np.add.at(stated, kind[own], np.diagonal(self.posterior.moment[own], 0, 1, 2))
+        for group in _GROUPS[k]:
+            for sums in (found, stated):
+                sums[:, group] = sums[:, group].mean(axis=1, keepdims=True)
+        # Each number is drawn to the mean of all, and that to what is stated.
+        known = FEWEST * k
+        mean = ((found.sum(axis=1) + known) / (stated.sum(axis=1) + known))[:, None]
+        self.noise = self.noise.learnt((found + known * mean) / (stated + known), self.accepted)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""
@@ -324,16 +307,13 @@ class Growth:
         if not len(rows):
             return rows
         found = self.innovations(rows)
-        fits = (found.square < self.given.gate(found.freedom)) & self.fits_found[rows]
-        refused = self.given.is_loop & ~self.accepted
-        refused[rows[fits]] = False
+        fits = found.square < self.given.gate(found.freedom)
         # Taken at their word, or by the noise that one run taught, all are noisier than they are,
         # so that more fit by chance: then only the rest says how many of the rest are false.
         true = (0 if self.noise.at_their_word or self.ventured.any()
                 else np.count_nonzero(self.loops))
         return np.asarray(rows[believable(
-            found, self.posterior, self.given.gate, fits, int(true), self.given.place[rows],
-            beside_refused(self.given.mates, refused, self.loops)[rows])])
+            found, self.posterior, self.given.gate, fits, int(true), self.given.place[rows])])
 
 
 def gain_of_places(growth: Growth, as_stated: Growth, cut: Growth) -> float:

@@ -30,31 +30,44 @@ class Noise:
     """
     How noisy odometry and loops were found to be.
 
-    stated : (2,) the variance that they state; variance : (2,) theirs in units of that;
+    stated : (2,) the variance that they state; variance : (2,) theirs in units of that, the
+    geometric mean of their numbers; shape : (2, k) of each number, in units of the mean;
     learnt_of : (m,) bool, the factors of which it was learnt last, (0,) of none; at_their_word :
     whether factors may be as noisy as they say.
     """
 
     stated: Array
     variance: Array
+    shape: Array
     learnt_of: Mask
     at_their_word: bool = False
 
     @staticmethod
-    def of(stated: Array) -> 'Noise':
-        """Return the noise that is stated, of which nothing is learnt."""
-        return Noise(stated, within_ratio(np.ones(2), stated), np.zeros(0, bool))
+    def of(stated: Array, k: int) -> 'Noise':
+        """Return the noise that is stated, of k numbers, of which nothing is learnt."""
+        return Noise(stated, within_ratio(np.ones(2), stated), np.ones((2, k)), np.zeros(0, bool))
 
     @property
     def assumed(self) -> Array:
-        """(2,) what factors are weighed by."""
-        return self.word if self.at_their_word else self.variance
+        """(2, k) what factors are weighed by."""
+        return self.word if self.at_their_word else self.each
+
+    @property
+    def each(self) -> Array:
+        """(2, k) the variance of each number."""
+        return self.variance[:, None] * self.shape
 
     @property
     def word(self) -> Array:
-        """(2,) where factors are as noisy as they say, or as was found."""
-        word = np.minimum(_WORD * self.variance, 1.0)
-        return within_ratio(np.maximum(self.variance, word), self.stated)
+        """(2, k) where factors are as noisy as they say, or as was found."""
+        word = np.maximum(self.each, np.minimum(_WORD * self.each, 1.0))
+        mean = _mean(word)
+        return word * (within_ratio(mean, self.stated) / mean)[:, None]
+
+    @property
+    def said(self) -> Array:
+        """(2,) how much larger the variance is that factors may have, than was found."""
+        return _mean(self.word / self.each)
 
     def is_known(self, accepted: Mask) -> bool:
         """Return whether there is nothing new to learn it of: what it was, says always more."""
@@ -65,9 +78,16 @@ class Noise:
         return replace(self, variance=within_ratio(variance, self.stated))
 
     def learnt(self, scale: Array, accepted: Mask) -> 'Noise':
-        """Return the noise so many times as large, (2,), learnt of what is accepted, (m,)."""
-        return replace(self.found(self.variance * scale), learnt_of=accepted.copy())
+        """Return the noise so many times as large, (2, k), learnt of what is accepted, (m,)."""
+        mean = _mean(scale)
+        return replace(self.found(self.variance * mean), shape=self.shape * scale / mean[:, None],
+                       learnt_of=accepted.copy())
 
     def forgotten(self) -> 'Noise':
         """Return the noise as if it were learnt of nothing."""
         return replace(self, learnt_of=self.learnt_of[:0])
+
+
+def _mean(variance: Array) -> Array:
+    """Return the geometric mean of the numbers of each kind, (2,), of (2, k)."""
+    return np.exp(np.log(variance).mean(axis=1))

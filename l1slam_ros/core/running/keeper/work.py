@@ -23,7 +23,7 @@ from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
-from l1slam_ros.core.robust.forecast import expected_error
+from l1slam_ros.core.robust.inspection import OFF_SCALE
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.improve import Check, front_of, improve, one_round
 from l1slam_ros.core.running.keeper.keeper import Keeper
@@ -38,8 +38,6 @@ _LEAST_ROUND = 0.1
 _PATIENCE = 4
 # [s] While a robot drives, all loops are judged from the graph alone for no longer if others came.
 _LONGEST = 10.0
-# With less confidence a map is more likely wrong than right.
-_EVEN = 0.5
 # Factors that a new front takes before it looks whether to stop.
 _AT_ONCE = 16
 
@@ -171,11 +169,11 @@ def _may_only_harm(of: Snapshot, judgement: Judgement, poses: Array) -> bool:
     """
     Return whether a robot drives better by the map that there is than by another one, (n, p).
 
-    That one is more likely wrong than right, and expects a larger error of itself than the two are
-    apart. What comes soon tells more: of Bicocca's first loops a run of lies makes a map that is 8
-    m off, where odometry is .5 m off.
+    That one takes the odometry for noisier than it says, and expects a larger error of itself than
+    the two are apart. What comes soon tells more: of Bicocca's first loops a run of lies makes a
+    map that is 8 m off, where odometry is .5 m off.
     """
     positions = of.graph.manifold.positions(poses)
-    return judgement.confidence < _EVEN and expected_error(
-        judgement.terms, positions) > absolute_trajectory_error(
-            positions, of.graph.manifold.positions(of.poses))
+    noisier = judgement.variance_meant[0] > OFF_SCALE
+    return bool(noisier) and judgement.expected_error > absolute_trajectory_error(
+        positions, of.graph.manifold.positions(of.poses))
