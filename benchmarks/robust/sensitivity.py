@@ -12,12 +12,11 @@ What becomes of maps when a constant of the judgement is half as large, and twic
     python benchmarks/robust/sensitivity.py --datasets DIR [--drawn N] [--only NAME...]
 
 Each number that stands alone as a constant of a module of `core/robust` is halved and doubled, one
-at a time, in every module that uses it. The runs are some of those of `verdict.py`: worlds of the
-set that its weights are fitted on, and graphs of `FIT`; no set that a record is claimed on. Of
-these are left out
+at a time, in every module that uses it. The runs are some of those of `verdict.py`: worlds of its
+first set, and graphs of `FIT`; no set that a record is claimed on. Of these are left out
 
 - three in four of those where nothing was near: the map was right, without a doubt, a slip or a
-  drift, and by the forecast surer than `_PLAIN`;
+  drift, and surer than `_PLAIN`;
 - those that take longer than `_SLOW`;
 - and of a constant those in which no function was called that reads it: there it tells nothing.
 

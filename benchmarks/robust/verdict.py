@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-How often a map was right, beside the forecast that was made of it: fits it, and counts its record.
+How often a map was right, beside the confidence in it: the makers' own worlds.
 
     python benchmarks/robust/verdict.py --datasets DIR [--seeds N] [--drawn N] [--fresh SET...]
         [--only GRAPH...]
@@ -36,14 +36,12 @@ from measuring import report_progress
 from robust import drawn
 from robust.changes import changed
 from robust.places import Place, error_by_time, place, place_of
-from scipy.optimize import minimize
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
-from l1slam_ros.core.robust.forecast import forecast
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
@@ -64,7 +62,6 @@ CONDITIONS: tuple[drawn.Condition, ...] = (
     ('aliased', (3, 'own'), '', 0.0), ('aliased', (3, 'same'), '', 0.0),
     ('half aliased', (12,), '', 0.0), ('drift', (0.01,), 'random', 0.3),
     ('drift', (0.05,), 'random', 0.3))
-_RIDGE = 0.3
 _EDGES = (0.0, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
 
 
@@ -74,12 +71,12 @@ class Row:
     One run.
 
     graph : its name, of a drawn world behind that of its set; asked : its seed and what was made
-    wrong in it; terms : (6,) of the forecast; wrong : whether the map was; doubts : their kinds.
+    wrong in it; confidence : of the map; wrong : whether the map was; doubts : their kinds.
     """
 
     graph: str
     asked: str
-    terms: Array
+    confidence: float
     wrong: bool
     doubts: frozenset[str]
 
@@ -205,7 +202,7 @@ def judged(name: str, found: Place, graph: FactorGraph, best: Array,
     outcome = solve(graph, None, SolveOptions(robust=True))
     judgement, poses = outcome.judgement, outcome.solution.poses[:, :2]
     assert judgement is not None
-    return Row(name, asked, judgement.terms, _is_wrong(found, poses, best),
+    return Row(name, asked, judgement.confidence, _is_wrong(found, poses, best),
                frozenset(doubt.kind for doubt in judgement.doubts)), judgement
 
 
@@ -214,15 +211,6 @@ def _is_wrong(found: Place, positions: Array, best: Array) -> bool:
         return found.truth_error(positions) > 1.5 * found.truth_error(best) + 0.05
     diagonal = np.linalg.norm(np.ptp(best, axis=0))
     return bool(absolute_trajectory_error(positions, best) > max(0.25, 0.005 * diagonal))
-
-
-def _fitted(rows: list[Row]) -> Array:
-    """Return the weights that make what became of some runs likeliest, drawn to zero a little."""
-    terms, wrong = np.array([row.terms for row in rows]), np.array([row.wrong for row in rows])
-    weights: Array = minimize(
-        lambda w: (np.logaddexp(0, terms @ w) - wrong * (terms @ w)).sum()
-        + _RIDGE * (w[1:]**2).sum(), np.zeros(terms.shape[1])).x
-    return weights
 
 
 def _tell(name: str, rows: list[Row]) -> None:
@@ -240,7 +228,7 @@ def _tell(name: str, rows: list[Row]) -> None:
             print('  wrong and silent:' if row.wrong else '  right and doubted:', row.graph,
                   row.asked, ', '.join(sorted(row.doubts)))
     print('\n| confidence | runs | said | right |\n|---|---|---|---|')
-    off = 1 - np.array([forecast(row.terms) for row in rows])
+    off = 1 - np.array([row.confidence for row in rows])
     for low, high in zip(_EDGES, _EDGES[1:], strict=False):
         among = (off >= low) & (off < high)
         if among.any():
@@ -281,8 +269,6 @@ def main() -> int:
     for row in rows:
         fresh, _, name = row.graph.rpartition(': ')
         halves.setdefault(fresh or ('HELD' if name in HELD else 'FIT'), []).append(row)
-    weights = _fitted(halves['FIT'] or rows)
-    print('weights that fit best:', ', '.join(f'{weight:.2f}' for weight in weights))
     for half, among in halves.items():
         if among:
             _tell(half, among)
