@@ -357,23 +357,21 @@ def slips(growth: Growth) -> list[Alternative]:
 
 def agreeing(growth: Growth) -> list[Alternative]:
     """
-    Return the map of refused loops of several places, or a long run, that agree with each other.
+    Return the map of refused loops of several places that agree, or of a long run across a gap.
 
-    They span a step of the odometry that no accepted loop does, or a gap: the odometry slipped
-    there, or as many are lies that agree. Either is as likely.
+    Several places span a step of the odometry that no accepted loop does: it slipped there, or as
+    many are lies that agree. Across a gap loops alone speak for either. Both are as likely.
     """
-    given, rows = growth.given, growth.undecided()
-    group = strongest_group(growth, rows)
-    if given.count_places(group) < TWO_PLACES:
-        group = longest_run(growth, rows)
-    if not len(group):
-        return []
-    accepted = growth.loops
+    given, rows, accepted = growth.given, growth.undecided(), growth.loops
     across = spanned(given.low[accepted], given.high[accepted], given.graph.n_poses)
+    group, run = strongest_group(growth, rows), longest_run(growth, rows)
     steps = common_steps(growth, group)
-    if not ((across[given.low[steps]] == 0) | growth.cut[steps]).any():
-        return []
-    return [Alternative(OTHER_MAP, group, 0.0)]
+    if given.count_places(group) >= TWO_PLACES and (
+            (across[given.low[steps]] == 0) | given.gap[steps]).any():
+        return [Alternative(OTHER_MAP, group, 0.0)]
+    if len(run) and given.gap[common_steps(growth, run)].any():
+        return [Alternative(OTHER_MAP, run, 0.0)]
+    return []
 
 
 def judge(

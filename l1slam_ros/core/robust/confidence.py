@@ -40,7 +40,7 @@ CONFIDENT = 0.9
 # What is less likely than this is no alternative.
 UNLIKELY = 1e-3
 # Maps are compared at so many keyframes.
-_COMPARED = 1000
+_COMPARED = 200
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,10 @@ class Drawn:
 
     def _errors(self, found: 'Drawn', own: Mask) -> Array:
         """Return the error of a map, at some keyframes, if this one is right, (q,) RMSE [m]."""
-        positions = self.manifold.positions
-        truth = np.stack([positions(self.manifold.retract(self.poses[own], step))
-                          for step in np.moveaxis(self.samples[own], 2, 0)])
+        positions, samples = self.manifold.positions, np.moveaxis(self.samples[own], 2, 0)
+        poses = np.tile(self.poses[own], (len(samples), 1))
+        truth = positions(self.manifold.retract(poses, samples.reshape(len(poses), -1)))
+        truth = truth.reshape(len(samples), -1, truth.shape[1])
         map_ = np.broadcast_to(positions(found.poses[own]), truth.shape)
         R, t = align(map_, truth)
         off = map_ @ R.swapaxes(1, 2) + t[:, None] - truth

@@ -85,6 +85,10 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     runs, gain = with_runs(growth)
     if runs and gain > most:
         found = runs
+    if not found and growth.cut.any():  # more is known than when these were cut
+        now = log_odds_of_slips(growth, motion)
+        growth.slip_odds |= {step: float(now[step]) for step in growth.slip_odds
+                             if growth.cut[step]}
     return found
 
 
