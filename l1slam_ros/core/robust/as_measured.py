@@ -23,6 +23,7 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.innovation import BY_CHANCE, student_quantile
 from l1slam_ros.core.robust.inspection import FEWEST
 from l1slam_ros.core.robust.judgement import Judgement, weighed
@@ -98,23 +99,23 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
 
 def _stays(graph: FactorGraph, judgement: Judgement) -> bool:
     """
-    Return whether just what is accepted fits by the noise found, too, without a doubt.
+    Return whether what is accepted fits by the noise found, too, but for one in a hundred.
 
     No, too, where that cannot be told: sigmas are of no more than some hundred times this noise.
     """
     factors = graph.between
     gate = student_quantile(1 - BY_CHANCE, factors.freedom, graph.manifold.TANGENT_SIZE)
     fits = factors.is_odometry | (judgement.sigmas**2 < judgement.variance[0] * gate)
-    return not judgement.doubts and bool((fits == judgement.accepted).all())
+    return not judgement.doubts and bool((fits != judgement.accepted).mean() <= DOUBT)
 
 
 def identity_roots(graph: FactorGraph) -> Array:
     """
-    Return the roots of the information where all of a kind state so many times the identity.
+    Return the roots of the information of odometry and of loops where all state the identity.
 
-    (2, k) of odometry and of loops, the diagonals of the identity; NaN where a kind states
-    something else, or there is none. An identity that was read as information of quaternions is
-    1/4 for angles: their vector part is half of the angle.
+    (2, k), the diagonals; NaN where a kind states something else, or there is none. An identity
+    that was read as information of quaternions is 1/4 for angles: their vector part is half of
+    the angle.
     """
     factors, manifold = graph.between, graph.manifold
     found = np.full((2, manifold.TANGENT_SIZE), np.nan)
@@ -122,8 +123,7 @@ def identity_roots(graph: FactorGraph) -> Array:
         for angles in (1.0,) if manifold is se2 else (1.0, 0.5):
             roots = np.ones(manifold.TANGENT_SIZE)
             roots[manifold.ROTATION] = angles
-            stated = factors.sqrt_information[kind]
-            if kind.any() and np.allclose(stated, stated[:, :1, :1] * np.diag(roots)):
+            if kind.any() and np.allclose(factors.sqrt_information[kind], np.diag(roots)):
                 own[:] = roots
     return found
 

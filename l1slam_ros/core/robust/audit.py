@@ -47,7 +47,7 @@ from l1slam_ros.core.robust.rounds.growth import Growth
 # An accepted place goes if it is less likely true than this, ln of odds; else it is a doubt.
 _CLEARLY_FALSE = -float(np.log(1 / DOUBT - 1))
 # ln of the ratio below which a refused place is not tried.
-_LEAST = -40.0
+_LEAST = -25.0
 # A place less likely than this, ln of odds, may be what is false where another one is.
 _RIVAL = 3.0
 # So many places are dropped, refused ones tried, and taken; a drop is settled in so many.
@@ -174,19 +174,33 @@ def _accepted(growth: Growth, rows: Indices, of: Indices, n: int, carried: Array
 
 def _refused(growth: Growth, rows: Indices, of: Indices, n: int, carried: Array
              ) -> tuple[Array, Array, Array]:
-    # C = I + Y Y' by samples: its inverse by that of the small matrix (M. A. Woodbury).
+    # C = I + Y Y' by samples, of all loops of a place together.
     system, q = growth.innovations(rows).system, kernels.prediction.SAMPLES
     k = system.block_size
     B, r = system.blocks[:, 1] @ carried, system.b.reshape(-1, k)
     Y = kernels.prediction.moved(system.keyframe, system.blocks, growth.posterior.samples)
     Y = Y / np.sqrt(q)
+    M, b, inner = np.zeros((n, k, k)), np.zeros((n, k)), np.zeros(n)
+    single = np.bincount(of, minlength=n)[of] == 1
+    at, Bt, own = of[single], B[single].transpose(0, 2, 1), r[single, :, None]
+    weighed = np.linalg.solve(np.eye(k) + Y[single] @ Y[single].transpose(0, 2, 1),
+                              np.concatenate((B[single], own), axis=2))
+    M[at], b[at] = Bt @ weighed[:, :, :k], (Bt @ weighed[:, :, k:])[:, :, 0]
+    inner[at] = (own * weighed[:, :, k:])[:, :, 0].sum(axis=1)
+    if single.all():
+        return M, b, inner
+    # Of several the inverse of C is that of a matrix of the samples (M. A. Woodbury).
+    several, of = np.unique(of[~single], return_inverse=True)
+    B, r, Y = B[~single], r[~single], Y[~single]
     Bt, Yt = B.transpose(0, 2, 1), Y.transpose(0, 2, 1)
-    BB, BY, YY = (_add(of, n, product) for product in (Bt @ B, Bt @ Y, Yt @ Y))
-    Br, Yr = (_add(of, n, (side @ r[:, :, None])[:, :, 0]) for side in (Bt, Yt))
+    BB, BY, YY = (_add(of, len(several), product) for product in (Bt @ B, Bt @ Y, Yt @ Y))
+    Br, Yr = (_add(of, len(several), (side @ r[:, :, None])[:, :, 0]) for side in (Bt, Yt))
     W = np.linalg.inv(np.eye(q) + YY)
     WY = (W @ Yr[:, :, None])[:, :, 0]
-    inner = _add(of, n, (r**2).sum(axis=1)) - (Yr * WY).sum(axis=1)
-    return (BB - BY @ W @ BY.transpose(0, 2, 1), Br - (BY @ WY[:, :, None])[:, :, 0], inner)
+    M[several] = BB - BY @ W @ BY.transpose(0, 2, 1)
+    b[several] = Br - (BY @ WY[:, :, None])[:, :, 0]
+    inner[several] = _add(of, len(several), (r**2).sum(axis=1)) - (Yr * WY).sum(axis=1)
+    return M, b, inner
 
 
 def _log_near(square: Array, log_det: Array, wide: Array, peak: Array, k: int) -> Array:

@@ -30,8 +30,8 @@ class Noise:
     """
     How noisy odometry and loops were found to be.
 
-    stated : (2,) the variance that they state; variance : (2,) theirs in units of that, the
-    geometric mean of their numbers; shape : (2, k) of each number, in units of the mean;
+    stated : (2,) the variance that they state; variance : (2,) theirs in units of that, the mean
+    of their numbers; shape : (2, k) of each number, in units of the mean;
     learnt_of : (m,) bool, the factors of which it was learnt last, (0,) of none; at_their_word :
     whether factors may be as noisy as they say.
     """
@@ -61,13 +61,13 @@ class Noise:
     def word(self) -> Array:
         """(2, k) where factors are as noisy as they say, or as was found."""
         word = np.maximum(self.each, np.minimum(_WORD * self.each, 1.0))
-        mean = _mean(word)
+        mean = word.mean(axis=1)
         return word * (within_ratio(mean, self.stated) / mean)[:, None]
 
     @property
     def said(self) -> Array:
         """(2,) how much larger the variance is that factors may have, than was found."""
-        return _mean(self.word / self.each)
+        return (self.word / self.each).mean(axis=1)
 
     def is_known(self, accepted: Mask) -> bool:
         """Return whether there is nothing new to learn it of: what it was, says always more."""
@@ -79,15 +79,10 @@ class Noise:
 
     def learnt(self, scale: Array, accepted: Mask) -> 'Noise':
         """Return the noise so many times as large, (2, k), learnt of what is accepted, (m,)."""
-        mean = _mean(scale)
-        return replace(self.found(self.variance * mean), shape=self.shape * scale / mean[:, None],
-                       learnt_of=accepted.copy())
+        each = self.each * scale
+        mean = each.mean(axis=1)
+        return replace(self.found(mean), shape=each / mean[:, None], learnt_of=accepted.copy())
 
     def forgotten(self) -> 'Noise':
         """Return the noise as if it were learnt of nothing."""
         return replace(self, learnt_of=self.learnt_of[:0])
-
-
-def _mean(variance: Array) -> Array:
-    """Return the geometric mean of the numbers of each kind, (2,), of (2, k)."""
-    return np.exp(np.log(variance).mean(axis=1))
