@@ -47,7 +47,7 @@ from l1slam_ros.core.robust.rounds.growth import Growth
 # An accepted place goes if it is less likely true than this, ln of odds; else it is a doubt.
 _CLEARLY_FALSE = -float(np.log(1 / DOUBT - 1))
 # ln of the ratio below which a refused place is not tried.
-_LEAST = -25.0
+_LEAST = -15.0
 # A place less likely than this, ln of odds, may be what is false where another one is.
 _RIVAL = 3.0
 # So many places are dropped, refused ones tried, and taken; a drop is settled in so many.
