@@ -37,7 +37,7 @@ from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.linear_system import with_world
-from l1slam_ros.core.robust.confidence import UNLIKELY, Alternative, Shifts, drawn
+from l1slam_ros.core.robust.confidence import UNLIKELY, Alternative, Drawn, Shifts, drawn
 from l1slam_ros.core.robust.gating import DOUBT, TINY, probability
 from l1slam_ros.core.robust.innovation import TAIL, claimed_volume, log_likelihood_ratio
 from l1slam_ros.core.robust.judgement import OTHER_MAP, UNCONFIRMED
@@ -64,21 +64,18 @@ class Places:
     """
     Places of loops as all else sees them.
 
-    number : (p,) as `Evidence.place`; accepted : (p,) bool; count : (p,) of loops; square : (p,)
-    ratio, mixed : (p,) ln of p(d if true) / p(d if false), false ones being uniform, or that or of
-    unknown size; chance, odds : (p,) ln of the chance to fit, and of false to true among such
-    places; information : (p, k, k) M, NaN where all else says too little of d; alone : (p,) bool,
-    nothing else tells of it; agrees : (p,) bool, the loops agree but for a common error; rows,
-    of : (m,) loops, and which place each is of.
+    number : (p,) as `Evidence.place`; accepted : (p,) bool; count : (p,) of loops; ratio, mixed :
+    (p,) ln of p(d if true) / p(d if false), false ones being uniform, or that or of unknown size;
+    odds : (p,) ln of false to true among such places; information : (p, k, k) M, NaN where all
+    else says too little of d; alone : (p,) bool, nothing else tells of it; agrees : (p,) bool, the
+    loops agree but for a common error; rows, of : (m,) loops, and which place each is of.
     """
 
     number: Indices
     accepted: Mask
     count: Indices
-    square: Array
     ratio: Array
     mixed: Array
-    chance: Array
     odds: Array
     information: Array
     alone: Mask
@@ -90,6 +87,13 @@ class Places:
     def likely(self) -> Array:
         """Ln of the odds of each to be true, (p,); against one that is alone nothing speaks."""
         return np.where(self.alone, np.inf, self.ratio - self.odds)
+
+    @property
+    def least_likely(self) -> list[int]:
+        """The accepted place that is least likely true, if clearly false, and the next; or []."""
+        likely = np.where(self.accepted, self.likely, np.inf)
+        order: list[int] = np.argsort(likely, kind='stable')[:2].tolist()
+        return order if order and likely[order[0]] <= _CLEARLY_FALSE else []
 
     def loops(self, place: int) -> Indices:
         """Return the loops of a place, (k,)."""
@@ -138,7 +142,7 @@ def places_of(growth: Growth) -> Places:
     _, odds = _local_odds(ratio, np.full(len(ratio), -np.inf), chance, count)
     mixed, others = _local_odds(ratio, near, chance, count)
     mixed += odds - others
-    return Places(number, accepted, count, square, ratio, mixed, chance, odds, information, alone,
+    return Places(number, accepted, count, ratio, mixed, odds, information, alone,
                   agrees | accepted, rows, of)
 
 
@@ -150,10 +154,15 @@ def _summed(growth: Growth, rows: Indices, said: Callable[..., tuple[Array, Arra
                                   return_inverse=True)
     if not len(rows):
         return number, first, of, np.zeros((0, k, k)), np.zeros((0, k)), np.zeros(0)
+    carried = _carried(growth, rows, rows[first][of])
+    return number, first, of, *said(growth, rows, of, len(number), carried)
+
+
+def _carried(growth: Growth, rows: Indices, first: Indices) -> Array:
+    """Return what a step at the end of the first loop of a place is at those of all, (m, k, k)."""
     manifold, high = growth.given.graph.manifold, growth.given.high
     poses = with_world(manifold, growth.poses)
-    carried = manifold.adjoint(manifold.between(poses[high[rows]], poses[high[rows[first]][of]]))
-    return number, first, of, *said(growth, rows, of, len(number), carried)
+    return manifold.adjoint(manifold.between(poses[high[rows]], poses[high[first]]))
 
 
 def _add(of: Indices, n: int, values: Array) -> Array:
@@ -321,16 +330,17 @@ def _drop(growth: Growth) -> list[Alternative]:
         count = len(dropped)
         for _ in range(_DROPPED):
             places = places_of(growth)
-            likely = np.where(places.accepted, places.likely, np.inf)
-            if not len(likely) or likely.min() > _CLEARLY_FALSE:
+            if not (least := places.least_likely):
                 break
-            worst, other = int(likely.argmin()), int(np.argsort(likely)[min(1, len(likely) - 1)])
+            worst, other = least[0], least[-1]
             loops, before = places.loops(worst), growth.copy()
             dropped.append(loops)
             growth.accepted[loops], growth.drops[loops] = False, _NEVER
             growth.solve()
+            likely = places.likely
             others.append(Alternative(OTHER_MAP, loops, float(likely[worst]), drawn(before)))
-            if places.count[worst] > 1 and other != worst and likely[other] < _RIVAL:
+            if (places.count[worst] > 1 and other != worst and places.accepted[other]
+                    and likely[other] < _RIVAL):
                 others += _instead(growth, before, places, worst, other)
         if len(dropped) == count:
             break
@@ -387,10 +397,9 @@ def _settle(state: Growth) -> Places:
     """Drop what all else speaks against, a few; return the places."""
     for number in range(_SETTLED + 1):
         places = places_of(state)
-        likely = np.where(places.accepted, places.likely, np.inf)
-        if number == _SETTLED or not len(likely) or likely.min() > _CLEARLY_FALSE:
+        if number == _SETTLED or not (least := places.least_likely):
             break
-        loops = places.loops(int(likely.argmin()))
+        loops = places.loops(least[0])
         state.accepted[loops], state.drops[loops] = False, _NEVER
         state.solve()
         state.accept_more()
@@ -398,7 +407,8 @@ def _settle(state: Growth) -> Places:
     return places
 
 
-def alternatives(growth: Growth, places: Places, known: list[Alternative]) -> list[Alternative]:
+def alternatives(growth: Growth, map_: Drawn, places: Places, known: list[Alternative]
+                 ) -> list[Alternative]:
     """Return the maps where one place is not what it is taken for, but for those known."""
     true = places.mixed - places.odds
     odds = np.where(places.accepted, -true, true)
@@ -412,7 +422,7 @@ def alternatives(growth: Growth, places: Places, known: list[Alternative]) -> li
     unsure = np.flatnonzero(odds > np.log(UNLIKELY))
     if not len(unsure):
         return []
-    shifts = Shifts(growth)
+    shifts = Shifts(growth, map_)
     found = []
     for k in unsure.tolist():
         loops = places.loops(k)
@@ -422,15 +432,8 @@ def alternatives(growth: Growth, places: Places, known: list[Alternative]) -> li
         other = None
         if np.isfinite(places.information[k]).all():
             at = np.searchsorted(np.flatnonzero(growth.accepted), loops)
-            other = shifts.without(at, _blocks(growth, loops, at), places.information[k])
+            B = growth.posterior.system.blocks[at, 1] @ _carried(
+                growth, loops, np.repeat(loops[:1], len(loops)))
+            other = shifts.without(at, B, places.information[k])
         found.append(Alternative(UNCONFIRMED, loops, float(odds[k]), other))
     return found
-
-
-def _blocks(growth: Growth, loops: Indices, at: Indices) -> Array:
-    """Return by how much a mistake of a place moves the whitened residuals of its loops."""
-    manifold = growth.given.graph.manifold
-    poses, high = with_world(manifold, growth.poses), growth.given.high
-    carried = manifold.adjoint(manifold.between(
-        poses[high[loops]], np.repeat(poses[high[loops[:1]]], len(loops), axis=0)))
-    return growth.posterior.system.blocks[at, 1] @ carried

@@ -261,10 +261,8 @@ def _sure_of_norm(graph: FactorGraph, judgement: Judgement, whole: FactorGraph, 
     noise = judgement.found_variance(graph)
     noise = np.concatenate((noise, np.ones(len(whole.between) - len(noise))))
     samples = spread_of(whole, seed, cholesky_of(whole), noise)
-    samples = np.concatenate((np.zeros((len(seed) - len(samples), *samples.shape[1:])), samples))
-    some = compared(len(seed))
-    other = Drawn(graph.manifold, seed[some], samples[some], np.zeros_like(poses[some, 0], int))
-    return 1.0 - replace(other, poses=poses[some]).harm(other)
+    other = Drawn.of(graph.manifold, seed, samples, np.zeros(len(seed), np.int64))
+    return 1.0 - replace(other, poses=poses[compared(len(poses))]).harm(other)
 
 
 def _norm_doubts(graph: FactorGraph, judgement: Judgement, sure: float) -> tuple[Doubt, ...]:
@@ -313,7 +311,7 @@ def judged(growth: Growth, places: Places, others: list[Alternative], ended: boo
     """
     graph, given = growth.given.graph, growth.given
     map_ = drawn(growth)
-    others = others + alternatives(growth, places, others) + slips(growth) + agreeing(growth)
+    others = others + alternatives(growth, map_, places, others) + slips(growth) + agreeing(growth)
     left_out = np.flatnonzero(given.is_loop & ~growth.accepted)
     if len(left_out) and not growth.loops.any():  # nothing confirms the odometry
         others.append(Alternative(WEAK, left_out, 0.0))
@@ -364,11 +362,12 @@ def agreeing(growth: Growth) -> list[Alternative]:
     """
     given, rows, accepted = growth.given, growth.undecided(), growth.loops
     across = spanned(given.low[accepted], given.high[accepted], given.graph.n_poses)
-    group, run = strongest_group(growth, rows), longest_run(growth, rows)
+    group = strongest_group(growth, rows)
     steps = common_steps(growth, group)
     if given.count_places(group) >= TWO_PLACES and (
             (across[given.low[steps]] == 0) | given.gap[steps]).any():
         return [Alternative(OTHER_MAP, group, 0.0)]
+    run = longest_run(growth, rows) if given.gap.any() else group[:0]
     if len(run) and given.gap[common_steps(growth, run)].any():
         return [Alternative(OTHER_MAP, run, 0.0)]
     return []

@@ -56,6 +56,13 @@ class Drawn:
     samples: Array
     part: Indices
 
+    @staticmethod
+    def of(manifold: Manifold, poses: Array, samples: Array, part: Indices) -> 'Drawn':
+        """Return a map (n, p) by samples of all keyframes but those held fixed, part (n,)."""
+        fixed = np.zeros((len(poses) - len(samples), *samples.shape[1:]))
+        some = compared(len(poses))
+        return Drawn(manifold, poses[some], np.concatenate((fixed, samples))[some], part[some])
+
     @property
     def expected(self) -> float:
         """The error [m] that the map expects of itself."""
@@ -116,7 +123,7 @@ def compared(n: int) -> slice:
 
 def drawn(growth: Growth) -> Drawn:
     """Return the map of a state, and its error by the noise that was found."""
-    given, fixed = growth.given, growth.posterior.fixed
+    given = growth.given
     variance, used = growth.noise.each, growth.noise.assumed
     samples = growth.posterior.samples[:-1]
     if not np.allclose(variance, used):
@@ -125,16 +132,14 @@ def drawn(growth: Growth) -> Drawn:
         noise = (variance / used)[given.is_loop[rows].astype(np.int64)]
         noise[given.factors.is_absolute[rows]] = 1.0
         samples = spread_of(graph, growth.poses, cholesky_of(graph), noise)
-    samples = np.concatenate((np.zeros((fixed, *samples.shape[1:])), samples))
-    some = compared(len(growth.poses))
-    return Drawn(given.graph.manifold, growth.poses[some], samples[some], growth.part[some])
+    return Drawn.of(given.graph.manifold, growth.poses, samples, growth.part)
 
 
 class Shifts:
     """Maps of a state, to first order, without a place that it accepts, or with one more."""
 
-    def __init__(self, growth: Growth):
-        self._growth, self._map = growth, drawn(growth)
+    def __init__(self, growth: Growth, map_: Drawn):
+        self._growth, self._map = growth, map_
         graph = growth.subgraph(np.flatnonzero(growth.accepted))
         self._cholesky = cholesky_of(graph)
         self._system = factorised(graph, growth.poses, self._cholesky)
