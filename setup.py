@@ -8,12 +8,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package's metadata; the version is that of package.xml, a test compares the rest with it."""
 
+import platform
 import sys
 from glob import glob
 from pathlib import Path
 from xml.etree import ElementTree
 
-from setuptools import find_packages, setup
+import numpy
+from setuptools import Extension, find_packages, setup
 
 package_name = 'l1slam_ros'
 
@@ -31,6 +33,29 @@ if not {'install', 'develop'}.intersection(sys.argv):
 # `colcon build --symlink-install` runs a link to this file, in a folder without these.
 readme, manifest = (Path(__file__).resolve().with_name(n) for n in ('README.md', 'package.xml'))
 
+# The compiled core, once for each level of processors; `native/__init__.py` takes the best that
+# runs. Sums may be reordered, which is what lets them be vectorised; NaN and infinity keep their
+# meaning. One file serves every Python from 3.10 on.
+NATIVE = f'{package_name}/core/native'
+LEVELS = {'portable': []}
+if platform.machine().lower() in ('x86_64', 'amd64'):
+    LEVELS['avx2'] = ['-march=x86-64-v3']
+extensions = [
+    Extension(
+        f'{NATIVE.replace("/", ".")}._{level}',
+        [f'{NATIVE}/{level}.cpp'],
+        include_dirs=[numpy.get_include()],
+        depends=sorted(glob(f'{NATIVE}/*.hpp')),
+        define_macros=[('Py_LIMITED_API', '0x030A0000'), ('NDEBUG', None)],
+        extra_compile_args=[
+            '-std=c++17', '-O3', '-g0', '-fvisibility=hidden', '-ffp-contract=fast',
+            '-fno-math-errno', '-fno-trapping-math', '-fno-signed-zeros', '-fassociative-math',
+            *flags,
+        ],
+        py_limited_api=True,
+    ) for level, flags in LEVELS.items()
+]
+
 setup(
     name=package_name,
     version=ElementTree.parse(manifest).findtext('version'),
@@ -41,6 +66,8 @@ setup(
     maintainer_email='maintainers@l1slam-ros.invalid',
     license='Apache-2.0',
     packages=find_packages(exclude=['test']),
+    ext_modules=extensions,
+    options={'bdist_wheel': {'py_limited_api': 'cp310'}},
     # Said though it is so anyway: then an editable install is a path, which type checkers follow,
     # and not a hook of the import, which they do not.
     package_dir={'': '.'},
@@ -49,7 +76,7 @@ setup(
         f'{package_name}.cli.report': ['page.html'],
     },
     data_files=data_files,
-    zip_safe=True,
+    zip_safe=False,
     python_requires='>=3.10',
     # Lower bounds: what Ubuntu 24.04, the home of ROS 2 Jazzy, ships. rosbags comes from PyPI
     # there too; before 0.11.6 it reads the messages of one time in any order.

@@ -1,0 +1,15 @@
+"""The compiled core; each module lists its functions with shapes and units."""
+
+from . import blocks as blocks
+from . import border as border
+from . import cholesky as cholesky
+from . import interior_point as interior_point
+from . import ordering as ordering
+from . import scans as scans
+from . import se2 as se2
+from . import se3 as se3
+from . import substitution as substitution
+from . import symbolic as symbolic
+
+LEVELS: tuple[str, ...]
+level: str

@@ -1,0 +1,131 @@
+// SPDX-License-Identifier: Apache-2.0
+// Vectors of N doubles, as many registers as the processor needs for them.
+#pragma once
+#include <cstdint>
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
+
+#if defined(__AVX512F__)
+constexpr int WIDTH = 8;
+#elif defined(__AVX__)
+constexpr int WIDTH = 4;
+#else
+constexpr int WIDTH = 2;
+#endif
+
+#define INLINE inline __attribute__((always_inline))
+// Else what a short loop goes through is in memory, and not in registers.
+#define UNROLL _Pragma("GCC unroll 16")
+
+// GCC takes these only with sizes that depend on no template.
+template <int W> struct RegisterOf;
+#define REGISTER(W) \
+    template <> struct RegisterOf<W> { \
+        typedef double Type __attribute__((vector_size(8 * W))); \
+        typedef double Unaligned __attribute__((vector_size(8 * W), aligned(8), may_alias)); \
+    };
+REGISTER(2) REGISTER(4) REGISTER(8)
+
+template <int N> struct Lanes {
+    static constexpr int W = N < WIDTH ? N : WIDTH, PARTS = N / W;
+    using Register = typename RegisterOf<W>::Type;
+    using Unaligned = typename RegisterOf<W>::Unaligned;
+    Register part[PARTS];
+
+    static INLINE Lanes zero() {
+        Lanes all;
+        UNROLL for (int p = 0; p < PARTS; p++) all.part[p] = Register{};
+        return all;
+    }
+    static INLINE Lanes load(const double* from) {
+        Lanes all;
+        UNROLL for (int p = 0; p < PARTS; p++)
+            all.part[p] = *reinterpret_cast<const Unaligned*>(from + p * W);
+        return all;
+    }
+    INLINE void store(double* to) const {
+        UNROLL for (int p = 0; p < PARTS; p++) *reinterpret_cast<Unaligned*>(to + p * W) = part[p];
+    }
+    // The first few lanes, zero in the others; and these alone written.
+    static INLINE Lanes load(const double* from, int count) {
+        Lanes all;
+        if (count == N) return load(from);
+        UNROLL for (int p = 0; p < PARTS; p++) {
+            Register r{};
+            int left = count - p * W;
+#if defined(__AVX512F__)
+            if constexpr (W == 8) {
+                r = (Register)_mm512_maskz_loadu_pd((1 << (left < 8 ? left : 8)) - 1, from + p * W);
+                all.part[p] = r;
+                continue;
+            }
+#endif
+#if defined(__AVX__)
+            if constexpr (W == 4) {
+                r = (Register)_mm256_maskload_pd(from + p * W, mask(left));
+                all.part[p] = r;
+                continue;
+            }
+#endif
+            for (int k = 0; k < W; k++) r[k] = k < left ? from[p * W + k] : 0.0;
+            all.part[p] = r;
+        }
+        return all;
+    }
+    INLINE void store(double* to, int count) const {
+        if (count == N) return store(to);
+        UNROLL for (int p = 0; p < PARTS; p++) {
+            int left = count - p * W;
+#if defined(__AVX512F__)
+            if constexpr (W == 8) {
+                _mm512_mask_storeu_pd(to + p * W, (1 << (left < 8 ? left : 8)) - 1,
+                                      (__m512d)part[p]);
+                continue;
+            }
+#endif
+#if defined(__AVX__)
+            if constexpr (W == 4) {
+                _mm256_maskstore_pd(to + p * W, mask(left), (__m256d)part[p]);
+                continue;
+            }
+#endif
+            for (int k = 0; k < W; k++)
+                if (k < left) to[p * W + k] = part[p][k];
+        }
+    }
+#if defined(__AVX__)
+    static INLINE __m256i mask(int left) {
+        static const int64_t table[8] = {-1, -1, -1, -1, 0, 0, 0, 0};
+        left = left < 0 ? 0 : left > 4 ? 4 : left;
+        return _mm256_loadu_si256(reinterpret_cast<const __m256i*>(table + 4 - left));
+    }
+#endif
+    INLINE void add(double factor, const Lanes& other) {
+        UNROLL for (int p = 0; p < PARTS; p++) part[p] += factor * other.part[p];
+    }
+    INLINE void take(double factor, const Lanes& other) {
+        UNROLL for (int p = 0; p < PARTS; p++) part[p] -= factor * other.part[p];
+    }
+    INLINE double operator[](int k) const { return part[k / W][k % W]; }
+    INLINE Lanes operator-(const Lanes& other) const {
+        Lanes all;
+        UNROLL for (int p = 0; p < PARTS; p++) all.part[p] = part[p] - other.part[p];
+        return all;
+    }
+    INLINE Lanes operator+(const Lanes& other) const {
+        Lanes all;
+        UNROLL for (int p = 0; p < PARTS; p++) all.part[p] = part[p] + other.part[p];
+        return all;
+    }
+    INLINE Lanes operator*(const Lanes& other) const {
+        Lanes all;
+        UNROLL for (int p = 0; p < PARTS; p++) all.part[p] = part[p] * other.part[p];
+        return all;
+    }
+    INLINE Lanes operator*(double factor) const {
+        Lanes all;
+        UNROLL for (int p = 0; p < PARTS; p++) all.part[p] = part[p] * factor;
+        return all;
+    }
+};

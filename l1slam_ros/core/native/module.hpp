@@ -1,0 +1,71 @@
+// SPDX-License-Identifier: Apache-2.0
+// The module as Python sees it: one submodule for each header. NAME is that of the module.
+#include "arrays.hpp"
+#include "blocks.hpp"
+#include "border.hpp"
+#include "cholesky.hpp"
+#include "interior_point.hpp"
+#include "ordering.hpp"
+#include "scans.hpp"
+#include "se2.hpp"
+#include "se3.hpp"
+#include "substitution.hpp"
+#include "symbolic.hpp"
+
+namespace {
+
+struct Part {
+    const char* name;
+    PyMethodDef* methods;
+};
+const Part parts[] = {
+    {"blocks", blocks::methods},
+    {"border", border::methods},
+    {"cholesky", cholesky::methods},
+    {"interior_point", interior_point::methods},
+    {"ordering", ordering::methods},
+    {"scans", scans::methods},
+    {"se2", se2::methods},
+    {"se3", se3::methods},
+    {"substitution", substitution::methods},
+    {"symbolic", symbolic::methods},
+};
+constexpr size_t PARTS = sizeof parts / sizeof *parts;
+
+// Whether this processor runs the code for AVX2 and FMA.
+PyObject* has_avx2(PyObject*, PyObject*) {
+#if defined(__x86_64__)
+    __builtin_cpu_init();
+    return PyBool_FromLong(__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"));
+#else
+    return PyBool_FromLong(0);
+#endif
+}
+PyMethodDef own_methods[] = {{"has_avx2", has_avx2, METH_NOARGS, nullptr}, {}};
+
+PyModuleDef definition_of(const char* name, PyMethodDef* methods) {
+    return {PyModuleDef_HEAD_INIT, name,    nullptr, -1, methods,
+            nullptr,               nullptr, nullptr, nullptr};
+}
+#define JOINED(a, b) a##b
+#define JOIN(a, b) JOINED(a, b)
+#define TEXT(a) #a
+#define TEXT_OF(a) TEXT(a)
+PyModuleDef definition = definition_of(TEXT_OF(NAME), own_methods);
+PyModuleDef definitions[PARTS];
+
+}  // namespace
+
+PyMODINIT_FUNC JOIN(PyInit_, NAME)() {
+    import_array();
+    PyObject* module = PyModule_Create(&definition);
+    for (size_t p = 0; module && p < PARTS; p++) {
+        definitions[p] = definition_of(parts[p].name, parts[p].methods);
+        PyObject* part = PyModule_Create(&definitions[p]);
+        if (!part || PyModule_AddObject(module, parts[p].name, part) < 0) {
+            Py_XDECREF(part);
+            Py_CLEAR(module);
+        }
+    }
+    return module;
+}
