@@ -162,7 +162,8 @@ def test_what_was_kept_for_who_comes_late_is_kept_by_replay_too_with_a_clock(ros
         b.until(lambda: grid and grid[0].data == '1', 'the last grid, though it is late')
         stamps = [message.clock.sec + 1e-9 * message.clock.nanosec for message in clock]
         assert min(stamps) == 1.0 and 4.9 < max(stamps) <= 5.0
-        assert [message.data for message in said][:5] == ['2', '3', '4', '2', '3']
+        # Nothing waits for this subscription: on a busy machine it may be late for the first.
+        assert ''.join(message.data for message in said[:5]) in '2342342'
         process.send_signal(signal.SIGTERM)
         assert process.wait(DEADLINE) == 0
     b.close()
