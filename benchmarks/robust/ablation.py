@@ -48,14 +48,13 @@ RULES: dict[str, Callable[..., Any]] = {
     'pairwise_consistency.longest_run': lambda growth, rows: _NONE,
     'pairwise_consistency.gain_of': gain_of_places,
     'odometry.drift_likelihood.likely_drifts': lambda graph: np.zeros(0),
-    'odometry.noisier.with_runs': lambda growth: (None, 0.0),
-    'odometry.noisier._noisier_costs': lambda growth, noisier: 0.0,
-    'odometry.slips.without_slip': lambda growth, as_stated: None,
-    'odometry.cuts.settled': lambda state, motion: state,
-    'odometry.cuts.put_back': lambda state, motion: state,
+    'odometry.hypotheses.noisier_run': lambda growth: [],
+    'odometry.hypotheses._log_likelihood_loss': lambda growth, noisier: 0.0,
+    'odometry.slips.slips': lambda growth, as_stated: [],
+    'odometry.slips._Search.pointers': lambda search: [],
+    'odometry.slips._Search.by_own_odds': lambda search: iter(()),
+    'odometry.cuts.moved_to_likeliest': lambda state, motion: state,
     'odometry.cuts.unusual': lambda state, motion: _NONE,
-    'odometry.slips._told': lambda growth, shown: [],
-    'odometry.untold.untold_slip': lambda growth, shown: {},
     'audit._with_uncontested': lambda growth: growth,
     'audit._drop': lambda growth: [],
     'batch.slips': lambda growth: [],
@@ -68,7 +67,7 @@ def places_of(rule: str) -> tuple[Any, list[Any], str]:
     """Return a function, the modules or the class that hold it, and its name there."""
     path, _, name = rule.rpartition('.')
     module, _, own = path.rpartition('.')
-    if own[0].isupper():
+    if own.lstrip('_')[0].isupper():
         holder = getattr(import_module(f'{robust.__name__}.{module}'), own)
         return vars(holder)[name], [holder], name
     function = getattr(import_module(f'{robust.__name__}.{path}'), name)

@@ -25,13 +25,13 @@ that are accepted, their L2 map, and what speaks against it. The model, and what
 3. Parts. What lies beyond a gap of the odometry is joined where loops of two places agree
    (`pairwise_consistency`).
 4. Hypotheses. Where loops do not fit, the odometry drifts, the same on each metre (`drift`), a
-   step of it slipped (`slips`), or it is noisier for a run (`noisier`): each is taken where it
-   explains more than it costs, ln of odds. Then again from 2.
+   step of it slipped (`slips`), or it is noisier along a run of loops (`hypotheses`): the
+   likeliest is taken where ln of its odds is above 0 (`repair`). Then again from 2.
 5. Audit. Each place is predicted by all else (`audit`): what is clearly false goes, what is
    refused and explains more than it costs comes in.
 6. Confidence. Each map that may be right in place of the one found, with its odds, and how
    likely the one found is wrong then (`confidence`). Below 90% it is doubtful, and these are the
-   doubts.
+   doubts; another norm is one below 80%.
 
 No loop is factored before it is accepted, so none bends what it is judged by.
 """
@@ -49,7 +49,6 @@ from l1slam_ros.core.robust.as_measured import FAILURES, Believed, OnRound, as_m
 from l1slam_ros.core.robust.audit import Places, alternatives, audit, places_of
 from l1slam_ros.core.robust.confidence import CONFIDENT, Alternative, Drawn, compared, drawn
 from l1slam_ros.core.robust.innovation import spread_of
-from l1slam_ros.core.robust.inspection import OFF_SCALE
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
     NORM,
@@ -65,10 +64,8 @@ from l1slam_ros.core.robust.judgement import (
     so_far,
 )
 from l1slam_ros.core.robust.odometry.cuts import join
-from l1slam_ros.core.robust.odometry.drift import Straight, likeliest, straightened
-from l1slam_ros.core.robust.odometry.drift_likelihood import likely_drifts
-from l1slam_ros.core.robust.odometry.noisier import with_runs
-from l1slam_ros.core.robust.odometry.slips import common_steps, without_slip
+from l1slam_ros.core.robust.odometry.repair import Repair
+from l1slam_ros.core.robust.odometry.slips import common_steps
 from l1slam_ros.core.robust.pairwise_consistency import longest_run, spanned, strongest_group
 from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
@@ -78,8 +75,8 @@ from l1slam_ros.core.solvers.gauss_newton import l2_map
 from l1slam_ros.core.solvers.nonlinear import Solution
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
 
-# As likely as not.
-_EVEN = 0.5
+# Below, a map is doubtful by its norm alone: its posterior takes the noise for independent.
+_SURE_OF_NORM = 0.8
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
 
@@ -106,7 +103,7 @@ def robust_solve(
     first = growth = Growth(graph, check)
     last = so_far(first), first.poses
     number = 0
-    repair = _Repair(graph, check)
+    repair = Repair(graph, rounds, check)
     try:
         first.begin()
         for number, growth in enumerate(rounds(first, repair), 1):
@@ -121,60 +118,6 @@ def robust_solve(
     except FAILURES as error:
         judgement, poses = known or last
         return judgement.broken_off(graph, error), poses
-
-
-class _Repair:
-    """
-    What loops that are left out may be right by.
-
-    drift : that of the odometry [rad/m]; rival : by how much more it may be; odds : ln of those of
-    the one against all its rivals.
-    """
-
-    def __init__(self, graph: FactorGraph, check: Callable[[], None]):
-        self._graph = graph
-        self._check = check
-        self._asked = False
-        self.drift = self.rival = 0.0
-        self.odds = np.inf
-
-    def __call__(self, found: Growth, as_stated: Growth) -> Growth | None:
-        """Return a state without a drift, asked once, or without a slip; None: there is none."""
-        straight = None if self._asked else self._straightened(found, as_stated)
-        self._asked = True
-        return straight or without_slip(found, as_stated)
-
-    def _straightened(self, found: Growth, as_stated: Growth) -> Growth | None:
-        """Return the state without a drift that explains the loops, or was taken for noise."""
-        best = stated = Straight(0.0, found, as_stated)
-        # Odometry that is so much noisier than it states may drift.
-        asked = len(as_stated.undecided()) or as_stated.noise.variance[0] > OFF_SCALE
-        drifts = likely_drifts(self._graph).tolist() if asked else []
-        if drifts:
-            some = [stated, *(end for drift in drifts for end in self._without(drift))]
-            begun = None if len(stated.loops) else with_runs(found)[0]
-            some += self._ends(0.0, begun) if begun else []
-            best, self.rival, self.odds = likeliest(some)
-        self.drift = best.drift
-        return None if best is stated else best.found
-
-    def _without(self, drift: float) -> list[Straight]:
-        """Return what odometry without a drift leads to."""
-        growth = Growth(straightened(self._graph, drift), self._check)
-        growth.begin()
-        return self._ends(drift, growth)
-
-    def _ends(self, drift: float, growth: Growth) -> list[Straight]:
-        """Return where rounds from a state end, by runs again if without loops; [] : nowhere."""
-        ends: list[Straight] = []
-
-        def ended(*states: Growth) -> Growth | None:
-            ends.append(Straight(drift, *states))
-            return None if len(ends[-1].loops) else with_runs(states[0])[0]
-
-        for _ in rounds(growth, ended):
-            self._check()
-        return ends
 
 
 @dataclass(frozen=True)
@@ -266,8 +209,8 @@ def _sure_of_norm(graph: FactorGraph, judgement: Judgement, whole: FactorGraph, 
 
 
 def _norm_doubts(graph: FactorGraph, judgement: Judgement, sure: float) -> tuple[Doubt, ...]:
-    """Return the doubt of a map that its norm makes as likely wrong as right, or more so."""
-    if sure > _EVEN:
+    """Return the doubt of a map that is likely wrong by its norm alone."""
+    if sure >= _SURE_OF_NORM:
         return ()
     return (doubt_of(graph, judgement.accepted & ~graph.between.is_odometry, NORM),)
 

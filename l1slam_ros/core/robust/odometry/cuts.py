@@ -7,12 +7,12 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What a cut of the odometry leads to: the sides of a step, joined by the loops across alone.
+Cuts of the odometry: a step is left out, its two sides are joined by the loops across it alone.
 
-In: a state of a robust solve, and a step that may have slipped. Out: the state without what it
-measured, and whether the motion is usual that is left there. Where both sides are parts of their
-own, each right in itself, the true loops across agree with each other (`pairwise_consistency`):
-parts are joined where loops of two places or more do. The sides of a gap are joined likewise.
+In: a robust state, and a step that may have slipped. Out: the state without the step's
+measurement, and whether it leaves the robot a usual motion there. If each side is a part that is
+right in itself, the true loops across agree with each other (`pairwise_consistency`): parts are
+joined where loops of two places or more agree. The sides of a gap are joined likewise.
 """
 
 import numpy as np
@@ -20,15 +20,13 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
 from l1slam_ros.core.graph.spanning_tree import pair_key, parents
-from l1slam_ros.core.robust.innovation import claimed_volume
 from l1slam_ros.core.robust.odometry.motion import Motion, steps_of, unwhitening
-from l1slam_ros.core.robust.odometry.untold import log_slip
 from l1slam_ros.core.robust.pairwise_consistency import spanned, strongest_across
 from l1slam_ros.core.robust.rounds.growth import Growth
 
 
 def join(growth: Growth) -> bool:
-    """Move parts to where loops across agree that they are; return whether any was."""
+    """Join parts where loops across agree; return whether any were joined."""
     joined = False
     while len(group := strongest_across(growth)):
         _join_by(growth, group)
@@ -37,7 +35,7 @@ def join(growth: Growth) -> bool:
 
 
 def _join_by(growth: Growth, group: Indices) -> None:
-    """Move the later one of two parts to where the first loop of a group says, accept all."""
+    """Align the later one of two parts by the first loop of a group, and accept the group."""
     given = growth.given
     manifold, loop = given.graph.manifold, group[0]
     fixed, moving = given.low[loop], given.high[loop]
@@ -54,39 +52,39 @@ def _join_by(growth: Growth, group: Indices) -> None:
     growth.solve()
 
 
-def without(growth: Growth, step: int) -> Growth | None:
+def cut_and_joined(growth: Growth, step: int) -> Growth | None:
     """
-    Return the state after the rounds that follow if a step is cut, None: it falls apart.
+    Return the state after the rounds that follow the cut of a step, None: it falls apart.
 
-    Where loops of two places or a long run do not join its sides, those do that came in before.
+    Its sides are joined by loops of two places or a long run, else by those accepted before.
     """
     state, span = growth.copy(), growth.given.spanning(step)
     state.cut[step] = True
     state.drops[:] = 0
     kept = state.copy()
-    told = (state.accepted & span).any()
-    if told:
+    is_spanned = (state.accepted & span).any()
+    if is_spanned:
         state.accepted[span] = state.given.trusted[span]
         state.solve()
     else:  # each side stays as it is
         state.label_parts()
     if not join(state) or state.across()[step]:
-        if told:
+        if is_spanned:
             kept.solve()
-        if not told or kept.across()[step]:
+        if not is_spanned or kept.across()[step]:
             return None
         state = kept
     state.accept_more()
     if not (state.accepted & ~growth.accepted).any():
-        state.learn_noise_anew()  # it was learnt of the slip, too
+        state.learn_noise_anew()  # the slip was part of its estimate
     return state
 
 
-def as_shown(growth: Growth, steps: list[int], loops: list[int]) -> Growth | None:
+def cut_at_loops(growth: Growth, steps: list[int], loops: list[int]) -> Growth | None:
     """
-    Return the state after the rounds that follow if steps are cut, None: it falls apart.
+    Return the state after the rounds that follow the cut of steps, None: it falls apart.
 
-    loops : for each step one that shows that it slipped, which joins its sides
+    loops : for each step the one that joins its sides
     """
     state, given = growth.copy(), growth.given
     state.cut[steps] = True
@@ -106,26 +104,8 @@ def as_shown(growth: Growth, steps: list[int], loops: list[int]) -> Growth | Non
     return state
 
 
-def odds_as_shown(state: Growth, steps: Indices, motion: Motion) -> float:
-    """
-    Return ln of the odds that steps slipped that are cut, if a loop each, else a lie, tells of it.
-
-    As in `shown_slips`, but for the prior; how the robot moved at each is known by all loops.
-    """
-    given, odds = state.given, 0.0
-    manifold = given.graph.manifold
-    claims = claimed_volume(manifold, state.poses)[manifold.TRANSLATION].sum()
-    start = manifold.identity(1)
-    for row in steps[:, None]:
-        moved, spread = _repaired(state, int(row[0]), row, np.zeros(1, np.int64))
-        slip = manifold.local(manifold.retract(start, moved), given.factors.measurement[row])
-        odds += float((motion.log_density(moved, spread) + log_slip(manifold, slip, spread, motion)
-                       - motion.log_density(steps_of(state, row)))[0])
-    return odds + len(steps) * float(claims)
-
-
-def settled(state: Growth, motion: Motion) -> Growth:
-    """Return the state, each step cut moved to where the robot, repaired, moves most as usual."""
+def moved_to_likeliest(state: Growth, motion: Motion) -> Growth:
+    """Return the state with each cut where it leaves the robot the likeliest motion."""
     for cut in np.flatnonzero(state.cut & ~state.given.gap).tolist():
         step = _likeliest(state, cut, motion)
         if step != cut:
@@ -134,19 +114,19 @@ def settled(state: Growth, motion: Motion) -> Growth:
 
 
 def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
-    """Return the step that slipped, by how the robot moves, of those that no loop tells apart."""
+    """Return the likeliest step to have slipped, by the motion, of those in series with a cut."""
     steps, side = _in_series(state, cut)
-    gain = motion.log_density(*_repaired(state, cut, steps, side)) - motion.log_density(
+    gain = motion.log_density(*motion_repaired(state, cut, steps, side)) - motion.log_density(
         steps_of(state, steps))
     return int(steps[np.argmax(gain)])
 
 
 def _in_series(state: Growth, cut: int) -> tuple[Indices, Indices]:
     """
-    Return the steps that all ways from one side of a cut to the other one lead along, (k,).
+    Return the steps in series with a cut: all ways between its sides lead along them, (k,).
 
-    To cut one of these instead contradicts no loop. The first one is the cut itself.
-    And for each 1 or -1, whether these lead on along it or back, 0 for the cut, (k,).
+    No loop tells them apart. The first is the cut itself. And for each 1 or -1, whether the way
+    runs along it forwards or backwards, 0 for the cut, (k,).
     """
     given = state.given
     start, end = int(given.low[cut]), int(given.high[cut])
@@ -177,7 +157,7 @@ def _in_series(state: Growth, cut: int) -> tuple[Indices, Indices]:
 
 
 def _measured_end(state: Growth, cut: int) -> Array:
-    """Return where the keyframe after a cut is by the step that is cut, (1, p)."""
+    """Return the pose after a cut by the measurement that is cut, (1, p)."""
     given, row = state.given, np.array([cut])
     end: Array = given.graph.manifold.compose(
         state.poses[given.low[row]], given.factors.measurement[row])
@@ -185,7 +165,7 @@ def _measured_end(state: Growth, cut: int) -> Array:
 
 
 def _cut_at(state: Growth, cut: int, step: int) -> Growth:
-    """Return the state that is cut at a step and not where it is."""
+    """Return the state with a cut moved to another step."""
     state, given = state.copy(), state.given
     state.cut[[cut, step]] = False, True
     holds = state.accepted & ~state.cut
@@ -205,18 +185,18 @@ def _cut_at(state: Growth, cut: int, step: int) -> Growth:
 
 def unusual(state: Growth, motion: Motion) -> Indices:
     """
-    Return the steps that are cut where the robot, repaired, does not move as elsewhere, (k,).
+    Return the cut steps that leave the robot a motion unlike any other, (k,).
 
-    Nor rather so than as measured: a slip is as rare as a mistake that many loops share. So the
-    odds of the one against the other are those of the motion that each leaves.
+    And no likelier one than was measured: a slip is as rare as an error that many loops share, so
+    the odds between the two are those of the motion that each leaves.
     """
     gate = state.given.gate(np.array([len(motion.mean)]))[0]
-    # All may be as noisy as they turn out, or as they say.
+    # With the estimated noise, or with the stated one.
     said = state.noise.said[0]
     found = []
     for cut in np.flatnonzero(state.cut & ~state.given.gap).tolist():
         row = np.array([cut])
-        repaired, spread = _repaired(state, cut, row, np.zeros(1, np.int64))
+        repaired, spread = motion_repaired(state, cut, row, np.zeros(1, np.int64))
         density = max(motion.log_density(repaired, noise * spread)[0] for noise in (1.0, said))
         if (motion.distance(repaired[0], spread[0]).min() >= gate
                 and density <= motion.log_density(steps_of(state, row))[0]):
@@ -224,9 +204,9 @@ def unusual(state: Growth, motion: Motion) -> Indices:
     return np.array(found, np.int64)
 
 
-def _repaired(state: Growth, cut: int, steps: Indices, side: Indices) -> tuple[Array, Array]:
+def motion_repaired(state: Growth, cut: int, steps: Indices, side: Indices) -> tuple[Array, Array]:
     """
-    Return how the robot moved at some steps if one of these slipped rather than that which is cut.
+    Return the motion at each of some steps if that one slipped in place of the one that is cut.
 
     Tangents (m, k) and their covariances (m, k, k). steps, side : (m,), see `_in_series`
     """

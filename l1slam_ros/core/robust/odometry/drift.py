@@ -7,14 +7,14 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A heading that drifts: each metre of the odometry turns by some angle too little.
+A drift of the heading: each metre of the odometry turns by some angle too little.
 
-In: a graph in the plane, and the states that its odometry leads to with and without a drift. Out:
-the odometry without it, and which drift is to be believed. Wheels of unequal size, or a gyroscope
-with an offset, do that.
+In: a graph in the plane, and the robust states that its odometry leads to with and without a
+drift. Out: the odometry without it, and the log evidence of each drift. Wheels of unequal size or
+the offset of a gyroscope cause one.
 
-`drift_likelihood` proposes drifts. Of laps that close also those by which each has a full turn
-more, so a map is made by each: the one by which the loops are likeliest is taken. Where another
+`drift_likelihood` proposes drifts, for laps that close also those with a full turn more on each
+lap. So a map is solved with each, and the one with the largest evidence is taken. Where another
 one is nearly as likely, the map is doubtful.
 """
 
@@ -29,6 +29,7 @@ from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.robust.innovation import claimed_volume, factorised, log_claims
 from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL
+from l1slam_ros.core.robust.odometry.hypotheses import Hypothesis
 from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
@@ -36,7 +37,7 @@ from l1slam_ros.core.solvers.gauss_newton import l2_map
 
 
 def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
-    """Return a graph in the plane, each step of whose odometry turns by `drift` more a metre."""
+    """Return a graph in the plane with `drift` added to the turn of each metre of odometry."""
     if not drift:
         return graph
     other = graph.subset(np.arange(len(graph.between)))
@@ -47,7 +48,7 @@ def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
 
 
 def corrected(factors: BetweenFactors, rows: Indices, drift: float) -> Array:
-    """Return what some odometry factors in the plane measured, without its drift, (k, 3)."""
+    """Return the measurements of odometry factors in the plane without a drift, (k, 3)."""
     measured = factors.measurement[rows]
     step = np.zeros((len(rows), 3))
     step[:, 2] = drift * _way(factors, rows)
@@ -61,13 +62,13 @@ def correction(factors: BetweenFactors, rows: Indices, made: Array) -> float:
 
 
 def _way(factors: BetweenFactors, rows: Indices) -> Array:
-    """Return how far some odometry factors lead [m], (k,), below 0 of those backwards in time."""
+    """Return the length of odometry factors [m], (k,), negative for those backwards in time."""
     along = np.where(factors.i[rows] < factors.j[rows], 1.0, -1.0)
     return along * np.hypot(*factors.measurement[rows, :2].T)
 
 
 def drift_turn(factors: BetweenFactors, rows: Indices) -> Array:
-    """Return by how much some odometry factors turn for a drift of 1 rad/m, whitened, (k, 3)."""
+    """Return the derivative of odometry residuals by the drift, whitened, (k, 3)."""
     turn = np.zeros((len(rows), 3))
     turn[:, 2] = np.hypot(*factors.measurement[rows, :2].T)
     return whiten(factors.sqrt_information[rows], turn)
@@ -76,10 +77,10 @@ def drift_turn(factors: BetweenFactors, rows: Indices) -> Array:
 @dataclass(frozen=True)
 class Straight:
     """
-    What odometry without a drift leads to.
+    The states that odometry without a drift leads to.
 
-    drift : it [rad/m]; found, told : the states with the noise as it was found, and where all may
-    be as noisy as they say.
+    drift : [rad/m]; found, told : with the estimated noise, and with the larger of this and the
+    stated one.
     """
 
     drift: float
@@ -88,17 +89,17 @@ class Straight:
 
     @cached_property
     def log_room(self) -> float:
-        """The ln of the volume that a lie could claim on this map, in its units."""
+        """The ln of the volume of the claims of an outlier on this map."""
         return float(claimed_volume(se2, self.told.poses).sum())
 
     @cached_property
     def log_evidence(self) -> float:
         """
-        Return ln p(loops if they are true | odometry) / p(loops if they are lies), one a place.
+        Return ln p(loops as inliers | odometry) / p(loops as outliers), one loop a place.
 
-        A loop alone at its place is one of many that could have fitted by chance. A drift d is
-        normal about none, and the map tells it as well as S, the inverse of a variance: of the
-        density of both the integral is left (P.-S. Laplace).
+        A loop alone at its place is one of many that could have fitted by chance. The drift has a
+        normal prior about 0, and the map estimates it with information S: Laplace's approximation
+        of the integral over it.
         """
         growth = self.told
         alone = np.count_nonzero(np.bincount(growth.given.place[self.loops]) == 1)
@@ -109,7 +110,7 @@ class Straight:
 
     @cached_property
     def stretches(self) -> float:
-        """Along how many stretches more than places loops are."""
+        """The number of stretches along which loops are, less that of places."""
         one, other = self.told.given.mates
         loops = np.isin(np.arange(len(self.told.accepted)), self.loops)
         near = np.bincount(one, loops[other], len(loops))[loops]
@@ -126,38 +127,32 @@ class Straight:
         return np.asarray(np.flatnonzero(self.told.loops))
 
 
-def likeliest(some: list[Straight]) -> tuple[Straight, float, float]:
+def hypotheses_of(some: list[Straight]) -> list[Hypothesis]:
     """
-    Return the likeliest of some drifts, by how much more a rival drifts, and ln of its odds.
+    Return the drifts that explain loops, against the first state, that without a drift.
 
-    The rival is 0 [rad/m] where there is none; the odds are those against all rivals together.
-
-    The first one is that without a drift. Where it explains loops, too, another has to be likelier
-    by what two places are worth, and a rival of a drift is less likely by no more than that.
-
-    The longer a place is, the larger is the map: on a smaller one there would be more such places
-    than loops were found at.
+    The longer the stretches along which places are, the larger is the map: on a smaller one there
+    would be more such places than loops were found at. Where loops are explained without a drift,
+    another one has to be likelier by `margin_of`.
     """
     widest = max(straight.log_room for straight in some)
-    values = np.array([straight.log_evidence + straight.stretches * (straight.log_room - widest)
-                       for straight in some])
-    sure = TWO_PLACES * some[0].told.given.log_odds_of_place
-    if len(some[0].loops):
-        values[0] += sure
-    first = int(np.argmax(values))
-    less = values[first] - values
-    rivals = [(less[k], other.drift - some[first].drift) for k, other in enumerate(some)
-              if less[k] < sure and k and len(other.loops) and other.drift != some[first].drift]
-    if not first or not rivals:
-        return some[first], 0.0, np.inf
-    return some[first], min(rivals)[1], -float(np.logaddexp.reduce([-less for less, _ in rivals]))
+    values = [straight.log_evidence + straight.stretches * (straight.log_room - widest)
+              for straight in some]
+    least = values[0] + (margin_of(some[0].told) if len(some[0].loops) else 0.0)
+    return [Hypothesis(straight.found, value - least, straight.drift)
+            for straight, value in zip(some[1:], values[1:], strict=True) if len(straight.loops)]
+
+
+def margin_of(growth: Growth) -> float:
+    """Return ln of the odds by which one drift has to be likelier than another: two places."""
+    return TWO_PLACES * growth.given.log_odds_of_place
 
 
 def _log_likelihood(growth: Growth, loops: Indices) -> float:
     """
-    Return the ln of how likely some loops, (k,), are if they are true, by the odometry.
+    Return ln p(loops as inliers | odometry), of some loops, (k,).
 
-    With the Jacobian J and the residuals r of both, whitened by roots of information U, H = J'J:
+    With the Jacobian J and the residuals r of both, whitened by roots U of information, H = J'J:
 
         sum over loops (ln det U - 3/2 ln 2 pi) - (r'r + ln det H - ln det H_odometry) / 2
     """
@@ -171,7 +166,7 @@ def _log_likelihood(growth: Growth, loops: Indices) -> float:
 
 
 def drift_information(growth: Growth) -> float:
-    """Return what a map says of the drift of its odometry, as the inverse of a variance."""
+    """Return the information of a map on the drift of its odometry, the inverse of a variance."""
     accepted = np.flatnonzero(growth.accepted)
     rows = np.flatnonzero(~(growth.given.is_loop | growth.cut)[accepted])
     turn = drift_turn(growth.given.factors, accepted[rows]) / np.sqrt(growth.noise.assumed[0])

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-How the robot moves, and what that and all loops say of the steps of the odometry.
+The motion model of the robot, and the odds of each odometry factor to have slipped.
 
-In: a robust solve. Out: the motion that the odometry shows, and the odds that a step slipped: that
-it says nothing, and the robot moved on as ever; or that all steps drift.
+In: a robust state. Out: the density of steps that the odometry shows, and ln of the odds that a
+step's measurement is void and the robot moved there as elsewhere.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from math import lgamma
 import numpy as np
 
 from l1slam_ros.core import kernels
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.robust.gating import SAME, TINY
 from l1slam_ros.core.robust.innovation import claimed_volume, log_likelihood_ratio
 from l1slam_ros.core.robust.rounds.growth import Growth
@@ -28,13 +28,13 @@ from l1slam_ros.core.robust.rounds.growth import Growth
 @dataclass(frozen=True)
 class Motion:
     """
-    How the robot moves: steps as tangents, normal but for the few most unusual ones.
+    The density of steps, as tangents: normal, with a power law for the tail.
 
-    step : (n, k) those of the odometry; mean, covariance : of these; of a share 1 / sqrt(n) the
-    squared distance is beyond `start`, where it falls off by a power (B. M. Hill, A simple general
-    approach to inference about the tail of a distribution, 1975). One of all is like no other:
-    rare : (k, k) its covariance, as wide each way as all are long, with any rotation. To back up
-    or turn round but once is as rare as a slip, so that it is no evidence of one.
+    step : (n, k) the steps of the odometry; mean, covariance : theirs. A share 1 / sqrt(n) has a
+    squared distance beyond `start`, where the density falls by a power (B. M. Hill, A simple
+    general approach to inference about the tail of a distribution, 1975). One step of all is
+    arbitrary: rare : (k, k) its covariance, as wide as all steps are long, with any rotation. A
+    robot that backs up once is as rare as a slip, hence no evidence of one.
     """
 
     step: Array
@@ -45,14 +45,14 @@ class Motion:
     rare: Array
 
     def square(self, step: Array, spread: Array | float = 0.0) -> tuple[Array, Array]:
-        """Return how unusual steps (m, k) are, squared, and ln det of their covariances, (m,)."""
+        """Return squared Mahalanobis distances of steps (m, k), and ln det of covariance, (m,)."""
         return _square(step - self.mean, self.covariance + spread)
 
     def log_density(self, step: Array, spread: Array | float = 0.0, own: bool = False) -> Array:
         """Return ln of the density of steps (m, k), known to spread (m, k, k) or its own, (m,)."""
         square, log_det = self.square(step, spread)
         n, k = self.step.shape
-        if own:  # each by all others: a jump would widen what it is judged by
+        if own:  # leave each out of the mean and covariance that it is compared with
             square /= np.maximum(1 - square / n, 1 / n)
         normal = -(square + k * np.log(2 * np.pi)) / 2
         # From the density of the square to that of a point on its ellipsoid.
@@ -66,20 +66,20 @@ class Motion:
     def distance(self, step: Array, spread: Array) -> Array:
         """Return the squared distances of a step (k,), known to spread (k, k), to all, (n,)."""
         n, k = self.step.shape
-        # All that there is lies in a cloud of Scott's bandwidth.
+        # The steps as a kernel density with Scott's bandwidth.
         covariance = spread + self.covariance * n ** (-2 / (k + 4))
         repeated = np.tile(covariance, (n, 1, 1))
         return kernels.prediction.normalise(repeated, self.step - step)[0]
 
 
 def steps_of(growth: Growth, rows: Indices) -> Array:
-    """Return what factors measure, in the order of time, as tangents (k, d)."""
+    """Return the measurements of factors, in the order of time, as tangents (k, d)."""
     manifold = growth.given.graph.manifold
     return manifold.local(manifold.identity(len(rows)), growth.given.factors.measurement[rows])
 
 
 def usual_motion(growth: Growth) -> Motion:
-    """Return how the robot moves by its odometry."""
+    """Return the motion model of the odometry that is not cut."""
     step = steps_of(growth, np.flatnonzero(growth.given.is_step & ~growth.cut))
     least = np.diag(SAME**2 * (step**2).mean(axis=0) + TINY)
     translation = growth.given.graph.manifold.TRANSLATION
@@ -90,7 +90,7 @@ def usual_motion(growth: Growth) -> Motion:
     square = np.sort(motion.square(step)[0])
     few = int(np.sqrt(len(step)))
     start = max(float(square[-few - 1]), float(len(least)))
-    # The one at the start is for steps that are all alike.
+    # Plus one: steps may be all alike.
     power = few / (1 + np.log(np.maximum(square[-few:] / start, 1.0)).sum())
     return replace(motion, start=start, power=power)
 
@@ -105,13 +105,12 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     """
     Return ln P(slipped) / P(measured) of each odometry factor, (m,); -inf of all else.
 
-    Of all of them one is expected to have slipped. Then it may say anything, and the robot moved
-    as it does where all others say it did, m with a covariance C. If it did not slip, the robot
-    moved as it does where this factor says so, and all others say what it says:
+    A priori one of all n has. Then its measurement z is arbitrary, and the robot moved by m, which
+    all other factors predict with covariance C; else it moved by z, which they predict, too:
 
-        p(m, C as motion) / (claims n p(z as motion) p(z - m; C))
+        p(m, C as motion) / (V n p(z as motion) p(z - m; C))
 
-    Of one that is cut, all others know nothing of it as it is.
+    with V the volume of the claims of an outlier.
     """
     given = growth.given
     odds = np.full(len(given.factors), -np.inf)
@@ -122,7 +121,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     at = np.searchsorted(np.flatnonzero(growth.accepted), rows)
     R, r = growth.posterior.moment[at], growth.posterior.residual[at]
     inverse = np.linalg.inv(R + TINY * np.eye(k))
-    # Of what no other says, the residual is rounding.
+    # Where no other factor predicts it, the residual is rounding.
     innovation = inverse @ R @ inverse @ r[:, :, None]
     measured = growth.uncut()
     cut = growth.cut[rows]
@@ -132,7 +131,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     root = unwhitening(measured, rows)
     spread = root @ inverse @ root.transpose(0, 2, 1)
     square, log_det = kernels.prediction.normalise(inverse.copy(), innovation[:, :, 0])
-    # All may be as noisy as they turn out, or as they say.
+    # With the estimated noise, or with the stated one.
     found = max((r[~cut] ** 2).sum() / np.trace(R[~cut], axis1=1, axis2=2).sum(), 1.0)
     said = growth.noise.said[0]
     fit = np.max([log_likelihood_ratio(square / noise, log_det + k * np.log(noise),
@@ -149,6 +148,17 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
 
 
 def unwhitening(growth: Growth, rows: Indices) -> Array:
-    """Return what makes whitened residuals of odometry steps of it, (k, d, d)."""
+    """Return L'^-1 of factors, which turns whitened residuals back, (k, d, d)."""
     roots = growth.subgraph(rows).between.sqrt_information
     return np.linalg.inv(roots).astype(np.float64, copy=False)
+
+
+def log_slip(manifold: Manifold, slip: Array, spread: Array, motion: Motion) -> Array:
+    """Return the log density of slips, tangents (k, d), known to (k, d, d): Cauchy, any turn."""
+    part = manifold.TRANSLATION
+    square = (slip[:, part] ** 2).sum(axis=1)
+    long = (motion.step[:, part] ** 2).sum(axis=1).mean()
+    wide = long + np.trace(spread[:, part, part], axis1=1, axis2=2)
+    size = (part.stop + 1) / 2
+    return (lgamma(size) - size * np.log(np.pi) + np.log(wide) / 2
+            - size * np.log(wide + square))
