@@ -10,6 +10,7 @@
 
 import numpy as np
 import pytest
+from command import solve_json
 from outliers import careful, chain_of, drive_of, laps, solved, with_lies
 
 DRIFT = 0.05
@@ -147,3 +148,34 @@ def test_a_jump_that_a_lap_closes_within_its_noise_is_a_slip(seed):
     found = solved(ring(400, 20, seed, 10).slipped([200], [0.0, 5.0, 0.0]))
     slip, = found.slips
     assert abs(slip - 200) < 5 and not found.doubts and found.error < 1.2
+
+
+def in_space(drive, path):
+    """Write a drive as a graph in space, whose heights and tilts are measured, too."""
+    rng, lines = np.random.default_rng(0), []
+    for (i, j), (x, y, turn), known in zip(
+            drive.pairs, drive.measured, drive.information, strict=True):
+        # Of the quaternion's vector part, as g2o means it: half the angle.
+        diagonal = [known[0, 0], known[1, 1], 400.0, 4e5, 4e5, 4 * known[2, 2]]
+        z, roll, pitch = rng.standard_normal(3) * [0.05, 0.003, 0.003]
+        half = np.array([roll / 2, pitch / 2, np.sin(turn / 2), np.cos(turn / 2)])
+        half /= np.linalg.norm(half)
+        upper = [diagonal[r] * (r == c) for r in range(6) for c in range(r, 6)]
+        numbers = ' '.join(f'{number:.9g}' for number in (x, y, z, *half, *upper))
+        lines.append(f'EDGE_SE3:QUAT {i} {j} {numbers}\n')
+    path.write_text(''.join(lines))
+    return path
+
+
+def test_a_drift_about_the_vertical_is_found_in_space(tmp_path, capsys):
+    bad = careful(400, 800, lies=100)
+    path = in_space(bad.drifting(DRIFT), tmp_path / 'space.g2o')
+    solved_map = tmp_path / 'solved.g2o'
+    said = solve_json(capsys, path, '--output', solved_map)
+    assert said['drift'] == pytest.approx(DRIFT, abs=2e-3) and not said['doubts']
+    assert {tuple(pair) for pair in said['rejected'] + said['suspect']} == {
+        tuple(pair) for pair in bad.pairs[bad.false].tolist()}
+    # What is written is the map, and what was measured stands beside it.
+    again = solve_json(capsys, solved_map)
+    assert again['drift'] == pytest.approx(said['drift'], abs=1e-9)
+    assert again['final_cost'] == pytest.approx(said['final_cost'], rel=1e-6)

@@ -23,7 +23,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.core.running.optimised import Optimised
@@ -223,8 +222,7 @@ def _limits(saved: SavedMap) -> Iterator[Limits]:
     yield 'noise', judgement.noise, judged, _POSITIVE
     yield 'variance', judgement.variance, (2,), _POSITIVE
     yield 'meant', judgement.meant, (2, judgement.meant.shape[1]), _POSITIVE
-    # Only in the plane is a drift looked for.
-    yield 'drift', np.array(judgement.drift), (), FINITE if graph.manifold is se2 else (0, 0)
+    yield 'drift', np.array(judgement.drift), (), FINITE
     yield 'robust', np.array(saved.robust), (), (False, True)
     yield 'slips', judgement.slips, (len(judgement.slips),), (0, m - 1)
     for doubt in judgement.doubts:

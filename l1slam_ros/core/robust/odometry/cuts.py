@@ -66,7 +66,7 @@ def cut_and_joined(growth: Growth, step: int) -> Growth | None:
     if is_spanned:
         state.accepted[span] = state.given.trusted[span]
         state.solve()
-    else:  # each side stays as it is
+    else:  # neither side changes
         state.label_parts()
     if not join(state) or state.across()[step]:
         if is_spanned:
@@ -125,7 +125,7 @@ def _in_series(state: Growth, cut: int) -> tuple[Indices, Indices]:
     """
     Return the steps in series with a cut: all ways between its sides lead along them, (k,).
 
-    No loop tells them apart. The first is the cut itself. And for each 1 or -1, whether the way
+    No loop distinguishes them. The first is the cut itself. And for each 1 or -1, whether the way
     runs along it forwards or backwards, 0 for the cut, (k,).
     """
     given = state.given
@@ -140,7 +140,7 @@ def _in_series(state: Growth, cut: int) -> tuple[Indices, Indices]:
     if way[-1] != start:
         return np.array([cut]), np.zeros(1, np.int64)
     one, other = np.array(way[:0:-1]), np.array(way[-2::-1])
-    # Of factors between the same keyframes the way leads along the first.
+    # Between the same keyframes the way takes the first factor.
     keys = pair_key(low, high, n)
     order = np.argsort(keys, kind='stable')
     along = order[np.searchsorted(keys[order], pair_key(one, other, n))]

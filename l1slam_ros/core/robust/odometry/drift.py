@@ -9,9 +9,9 @@
 """
 A drift of the heading: each metre of the odometry turns by some angle too little.
 
-In: a graph in the plane, and the robust states that its odometry leads to with and without a
-drift. Out: the odometry without it, and the log evidence of each drift. Wheels of unequal size or
-the offset of a gyroscope cause one.
+In: a graph, and the robust states that its odometry leads to with and without a drift. Out: the
+odometry without it, and the log evidence of each drift. Wheels of unequal size or the offset of a
+gyroscope cause one. In space the heading is about the vertical axis of the robot.
 
 `drift_likelihood` proposes drifts, for laps that close also those with a full turn more on each
 lap. So a map is solved with each, and the one with the largest evidence is taken. Where another
@@ -23,12 +23,12 @@ from functools import cached_property
 
 import numpy as np
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry import se2, se3
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.robust.innovation import claimed_volume, factorised, log_claims
-from l1slam_ros.core.robust.odometry.drift_likelihood import USUAL
+from l1slam_ros.core.robust.odometry.drift_likelihood import HEADING, USUAL
 from l1slam_ros.core.robust.odometry.hypotheses import Hypothesis
 from l1slam_ros.core.robust.rounds.evidence import TWO_PLACES
 from l1slam_ros.core.robust.rounds.growth import Growth
@@ -37,7 +37,7 @@ from l1slam_ros.core.solvers.gauss_newton import l2_map
 
 
 def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
-    """Return a graph in the plane with `drift` added to the turn of each metre of odometry."""
+    """Return a graph with `drift` added to the turn of each metre of odometry."""
     if not drift:
         return graph
     other = graph.subset(np.arange(len(graph.between)))
@@ -48,17 +48,22 @@ def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
 
 
 def corrected(factors: BetweenFactors, rows: Indices, drift: float) -> Array:
-    """Return the measurements of odometry factors in the plane without a drift, (k, 3)."""
+    """Return the measurements of odometry factors without a drift, (k, p)."""
     measured = factors.measurement[rows]
-    step = np.zeros((len(rows), 3))
-    step[:, 2] = drift * _way(factors, rows)
-    return se2.retract(measured, step)
+    step = np.zeros((len(rows), factors.sqrt_information.shape[1]))
+    step[:, HEADING] = drift * _way(factors, rows)
+    return _manifold(measured).retract(measured, step)
 
 
 def correction(factors: BetweenFactors, rows: Indices, made: Array) -> float:
-    """Return the drift [rad/m] for which `corrected` returns `made`, (k, 3); none: 0."""
-    turn, way = se2.local(factors.measurement[rows], made)[:, 2], _way(factors, rows)
+    """Return the drift [rad/m] for which `corrected` returns `made`, (k, p); none: 0."""
+    turn = _manifold(made).local(factors.measurement[rows], made)[:, HEADING]
+    way = _way(factors, rows)
     return float(turn @ way / (way @ way)) if way.any() else 0.0
+
+
+def _manifold(poses: Array) -> Manifold:
+    return se2 if poses.shape[1] == se2.POSE_SIZE else se3
 
 
 def _way(factors: BetweenFactors, rows: Indices) -> Array:
@@ -68,9 +73,9 @@ def _way(factors: BetweenFactors, rows: Indices) -> Array:
 
 
 def drift_turn(factors: BetweenFactors, rows: Indices) -> Array:
-    """Return the derivative of odometry residuals by the drift, whitened, (k, 3)."""
-    turn = np.zeros((len(rows), 3))
-    turn[:, 2] = np.hypot(*factors.measurement[rows, :2].T)
+    """Return the derivative of odometry residuals by the drift, whitened, (k, d)."""
+    turn = np.zeros((len(rows), factors.sqrt_information.shape[1]))
+    turn[:, HEADING] = np.hypot(*factors.measurement[rows, :2].T)
     return whiten(factors.sqrt_information[rows], turn)
 
 
@@ -90,7 +95,7 @@ class Straight:
     @cached_property
     def log_room(self) -> float:
         """The ln of the volume of the claims of an outlier on this map."""
-        return float(claimed_volume(se2, self.told.poses).sum())
+        return float(claimed_volume(self.told.given.graph.manifold, self.told.poses).sum())
 
     @cached_property
     def log_evidence(self) -> float:
@@ -162,7 +167,8 @@ def _log_likelihood(growth: Growth, loops: Indices) -> float:
     system = factorised(graph, l2_map(graph, growth.poses, cholesky), cholesky)
     numbers = growth.given.factors.freedom[loops].sum()
     square = float(system.b @ system.b) + numbers * np.log(2 * np.pi) + cholesky.log_det()
-    return float(log_claims(graph.between, np.zeros(3)).sum() - square / 2)
+    no_volume = np.zeros(graph.manifold.TANGENT_SIZE)
+    return float(log_claims(graph.between, no_volume).sum() - square / 2)
 
 
 def drift_information(growth: Growth) -> float:

@@ -7,23 +7,23 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The drifts of the heading that loops may agree on.
+The likelihood of drifts of the heading, from all loops at once.
 
-In: a graph in the plane, of whose loops nothing is believed yet. Out: the drifts d [rad/m]. A true
-loop from keyframe i to j, with s metres of way between them, says by how much the odometry has
-turned too little:
+In: a graph without accepted loops; in space, its projection onto the plane in which the robot
+stands. Out: the likely drifts d [rad/m]. An inlier from keyframe i to j, s metres of way apart,
+measures by how much the odometry has turned too little:
 
     phi = wrap(z_theta - (theta_j - theta_i)) = d s + noise,
 
-the noise normal, of the loop and of q times what the odometry states of its turns; a lie says any
-angle. The share of true loops is found with it (expectation and maximisation). Loops of one place
-count once for each stretch of it.
+the noise normal, from the loop and from q times the stated variance of the odometry's turns; the
+angle of an outlier is uniform. The share of inliers is estimated with d (expectation and
+maximisation). Loops of one place count once for each stretch of it.
 
-Angles are the same after a full turn, and a robot that goes round in laps turns as much all the
-time: lies that say two poses look the same way agree on a drift by which it never turned. So
-angles only propose drifts. Which ones may be, positions decide, with the covariance that the noise
-of all steps between makes of angle and position. Laps may close with a turn more on each even so,
-and loops of two laps share most of their errors, which is not counted here: `drift` decides.
+Angles repeat after a full turn, and a robot that goes round in laps turns at an even rate: false
+loops between poses of equal heading agree on a drift of a turn a lap. So angles only propose
+drifts; positions decide, with the covariance of angle and position that the noise of all steps
+between causes. Laps may close with one more turn each even so, and loops of two laps share most of
+their errors, which is not modelled here: `drift` decides.
 
 Source: ours, defended by `test_drift.py`.
 """
@@ -41,20 +41,22 @@ from l1slam_ros.core.robust.gating import TINY
 from l1slam_ros.core.robust.pairwise_consistency import ASKED
 from l1slam_ros.core.robust.places import places
 
-# [rad/m] What wheels and gyros drift by: its standard deviation, and the most that is looked for.
+# The heading in the tangents of both manifolds: about the vertical.
+HEADING = -1
+# [rad/m] The standard deviation of the drift of wheels and gyroscopes, and the largest one tried.
 USUAL, _MOST = 0.03, 0.18
-# [rad/m] Drifts are looked for so far apart; near so many of the likeliest, twice as near
-# each time, until the longest loop tells them apart by no more than so much [rad].
+# [rad/m] The grid of drifts; the number of peaks that are refined, by halves, until the longest
+# loop turns by no more than `_FINE` [rad] from one to the next.
 _STEP = 0.0008
 _PEAKS = 40
 _FINE = 0.02
-# Nearly as likely as the likeliest is none with this part of its odds to all loops being lies, and
-# worth a look another drift: loops of a lap share much of their errors, so that odds are less than
-# they seem. So many are looked at most.
+# Fractions of the largest log likelihood (0: all loops are outliers) from which on no drift is
+# likely enough, and another drift is tried; loops of a lap share errors, which overstates it. The
+# number of drifts tried at most.
 _NONE = 0.75
 _ANOTHER = 0.5
 _TRIED = 8
-# What the odometry states of its turns may be off by, in variance.
+# Factors q on the stated variance of turns.
 _NOISE = np.logspace(-3, 3, 13)
 # Rounds of expectation and maximisation of the share of true loops.
 _ROUNDS = 12
@@ -64,16 +66,16 @@ def likely_drifts(graph: FactorGraph) -> Array:
     """
     Return the drifts of the heading [rad/m] that loops agree on, (p,), the likeliest first.
 
-    Laps that close also close if each has a full turn more: several may be worth a look. There
-    are none where loops are nearly as likely without a drift.
+    None where loops are nearly as likely without a drift. Several where laps also close with a
+    full turn more on each.
     """
     rows = np.flatnonzero(~graph.between.is_odometry & ~graph.between.is_absolute)
-    if graph.manifold is not se2 or not len(rows):
+    if not len(rows):
         return np.zeros(0)
     rows = rows[:: max(1, len(rows) // ASKED)]
     likelihood = _DriftLikelihood(bridged(graph), rows)
     drifts = likelihood.peaks()
-    if not len(drifts):  # of noise so large that none is likelier than the next
+    if not len(drifts):  # too noisy for a peak
         return drifts
     values = np.array([likelihood.value(drift, USUAL**2) for drift in drifts])
     most = values.max()
@@ -84,9 +86,14 @@ def likely_drifts(graph: FactorGraph) -> Array:
     return near
 
 
+def _in_plane(graph: FactorGraph, poses: Array) -> Array:
+    """Return poses, (k, p), projected onto the plane in which the robot stands, (k, 3)."""
+    return se2.from_pose3(graph.manifold.to_pose3(poses))
+
+
 def _weights(place: Indices, ends: Array) -> Array:
     """
-    Return the weight of each loop, (k,): a place counts once for each stretch that is near.
+    Return the weight of each loop, (k,): a place counts once for each of its stretches.
 
     place, ends : see `places`
     """
@@ -101,29 +108,31 @@ def _weights(place: Indices, ends: Array) -> Array:
 
 class _DriftLikelihood:
     """
-    How likely drifts of the odometry are, by k loops of a graph without gaps.
+    The likelihood of drifts of the odometry, by k loops of a graph without gaps.
 
-    chain : (n, 3) poses along the odometry; way : (n,) metres to each; noise : (n, 2) variance of
-    the position and of the heading of the step to each, as stated; low, high : (k,) the ends of
-    each loop; measured : (k, 3) by it; own : (k, 3, 3) its covariance; weight : (k,) of each;
-    metres, turns, lack : (k,) the way between its ends, the variance of turns on it, and what
-    these lack; walk : the variance of a drift that is but noise.
+    chain : (n, 3) poses along the odometry; way : (n,) metres to each; noise : (n, 2) the stated
+    variance of position and heading of the step to each; low, high : (k,) the ends of each loop;
+    measured : (k, 3) its measurement; own : (k, 3, 3) its covariance; weight : (k,) of each;
+    metres, turns, lack : (k,) the way between its ends, the variance of turns along it, and phi;
+    walk : the variance of the drift that white noise alone makes.
     """
 
     def __init__(self, graph: FactorGraph, rows: Indices):
-        chain = self.chain = odometry_poses(graph)
+        whole = odometry_poses(graph)
+        chain = self.chain = _in_plane(graph, whole)
         low, high, measured = ends_in_time(graph)
-        low, high, measured = low[rows], high[rows], measured[rows]
+        low, high, measured = low[rows], high[rows], _in_plane(graph, measured[rows])
         factors = graph.between
         steps = np.flatnonzero(factors.is_odometry & ~graph.is_landmark[factors.j])
-        covariance = covariance_of(factors.sqrt_information)
+        part = np.array([0, 1, HEADING])
+        covariance = covariance_of(factors.sqrt_information)[:, part[:, None], part]
         way, noise = np.zeros(graph.n_poses), np.zeros((graph.n_poses, 2))
         at = np.maximum(factors.i, factors.j)[steps]
         way[at] = np.hypot(*factors.measurement[steps, :2].T)
         noise[at] = np.stack((np.trace(covariance[steps, :2, :2], axis1=1, axis2=2) / 2,
                               covariance[steps, 2, 2]), axis=1)
         way, turns = np.cumsum(way), np.cumsum(noise[:, 1])
-        place, ends = places(graph, chain)
+        place, ends = places(graph, whole)
         self.weight = _weights(place[rows], ends[rows])
         self.way, self.noise = way, noise
         self.walk = turns[-1] / max(way[-1], TINY) ** 2
@@ -133,7 +142,7 @@ class _DriftLikelihood:
         self.lack = measured[:, 2] - (chain[high, 2] - chain[low, 2])
 
     def peaks(self) -> Array:
-        """Return the drifts, (p,), near which most of the headings agree, likeliest first."""
+        """Return the peaks of the likelihood by headings, (p,), the likeliest first."""
         drift = np.arange(-_MOST, _MOST + _STEP / 2, _STEP)
         values = self._by_headings(drift, _STEP, _NOISE)
         value, noise = np.max(values, axis=0), _NOISE[np.argmax(values, axis=0)]
@@ -143,7 +152,7 @@ class _DriftLikelihood:
         return np.array([self._refined(drift[peak], noise[peak]) for peak in at])
 
     def _refined(self, drift: float, q: float) -> float:
-        """Return where the peak near a drift is, as finely as the longest loop tells."""
+        """Return the peak near a drift, as finely as the longest loop resolves."""
         step = _STEP
         while step * self.metres.max() > _FINE:
             step /= 2
@@ -153,20 +162,20 @@ class _DriftLikelihood:
 
     def _by_headings(self, drift: Array, step: float, noise: Array) -> Array:
         """
-        Return the ln of the likelihood of drifts, known to a step, by headings alone, (q, d).
+        Return the log likelihood of drifts on a grid, by headings alone, (q, d).
 
-        drift : (d,); noise : (q,) what the odometry states of its turns is off by, in variance
+        drift : (d,); step : of the grid; noise : (q,) factors on the stated variance of turns
         """
-        # Single precision tells peaks apart, and takes half the time.
+        # Single precision resolves the peaks in half the time.
         square = (se2.wrap(self.lack - drift[:, None] * self.metres) ** 2 / 2).astype(np.float32)
         values = []
         for q in noise.tolist():
             variance = self.own[:, 2, 2] + q * self.turns + (self.metres * step) ** 2 / 12
             even = np.where(variance > np.pi**2 / 3, 1.0, 0.0)
             ratio = np.exp(square * (-1 / variance).astype(np.float32))
-            # A lie's turn has the density 1 / (2 pi).
+            # The density of an outlier's turn is 1 / (2 pi).
             ratio *= np.sqrt(2 * np.pi / variance).astype(np.float32)
-            # All around the circle, what is wider than it is even.
+            # A normal density wider than the circle is uniform on it.
             np.maximum(ratio, even.astype(np.float32), out=ratio)
             values.append(_log_likelihood(ratio, self.weight) + log_prior(
                 drift, USUAL**2 + q * self.walk))
@@ -174,9 +183,9 @@ class _DriftLikelihood:
 
     def value(self, drift: float, usual: float) -> float:
         """
-        Return the ln of the likelihood of a drift, by what loops measure, and of its prior.
+        Return the log likelihood of a drift by whole loops, plus ln of its prior.
 
-        usual : its variance, but for what noise makes
+        usual : the variance of the prior, to which that of white noise is added
         """
         low, high = self.low, self.high
         heading = self.chain[:, 2] + drift * self.way
@@ -196,7 +205,7 @@ class _DriftLikelihood:
         turned[:, 0, 1] = -sine
         turned[:, 2, 2] = 1.0
         own = turned @ self.own @ turned.transpose(0, 2, 1)
-        # Lies claim anything, as far as the way leads.
+        # Outliers are uniform over the extent of the way.
         log_room = np.log(2 * np.pi**2 * np.var(at))
         log_ratio = np.empty((len(_NOISE), len(low)))
         for row, q in zip(log_ratio, _NOISE, strict=True):
@@ -207,16 +216,16 @@ class _DriftLikelihood:
         return float(values.max())
 
     def _spread(self, at: Array) -> Array:
-        """Return the covariances (k, 3, 3) that the steps make, positions being (n, 2)."""
+        """Return the covariances of loops by the noise of steps, (k, 3, 3); positions (n, 2)."""
         position, turn = self.noise.T
-        # Each turn moves the end of a loop by its distance to it, sideways.
+        # A turn moves the end of a loop sideways, in proportion to its distance.
         side = np.column_stack((-at[:, 1], at[:, 0]))
         first = turn[:, None] * side
         sums = np.cumsum(np.column_stack((position, turn, first, first[:, :1] * side,
                                           first[:, 1] * side[:, 1])), axis=0)
         sums = sums[self.high] - sums[self.low]
         end = side[self.high]
-        # The sums of the turns' variances, and of these times what each is to the side.
+        # The sums of the variances of turns, and of their products with the lever arms.
         zero, one = sums[:, 1], sums[:, 2:4]
         spread = np.empty((len(end), 3, 3))
         spread[:, :2, 2] = spread[:, 2, :2] = zero[:, None] * end - one
@@ -230,15 +239,15 @@ class _DriftLikelihood:
 
 
 def log_prior(drift: Array | float, variance: Array | float) -> Array | float:
-    """Return the ln of the density of drifts, normal about none."""
+    """Return ln of the prior density of drifts, normal about 0."""
     return -(drift**2 / variance + np.log(2 * np.pi * variance)) / 2
 
 
 def _log_likelihood(ratio: Array, weight: Array) -> Array:
     """
-    Return the ln of the likelihood of each drift, (d,), the share of true loops at its best.
+    Return the log likelihood of each drift, (d,), with the best share of inliers.
 
-    ratio : (d, k) how much likelier each loop is true than false
+    ratio : (d, k) likelihood of each loop as an inlier over that as an outlier
     """
     share = np.full((len(ratio), 1), 0.5, ratio.dtype)
     part = (weight / weight.sum()).astype(ratio.dtype)

@@ -69,7 +69,7 @@ class Repair:
 
     def _straightened(self, growth: Growth, as_stated: Growth) -> Hypothesis | None:
         """Return the likeliest drift of those that loops propose, None: rather none."""
-        # Odometry that is so much noisier than it states may drift.
+        # Odometry much noisier than stated may drift.
         if not len(as_stated.undecided()) and as_stated.noise.variance[0] <= OFF_SCALE:
             return None
         some = [Straight(0.0, growth, as_stated)]

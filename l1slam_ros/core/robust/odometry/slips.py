@@ -10,10 +10,10 @@
 Slips of the odometry: hypotheses that some of its factors are outliers.
 
 In: a robust state that accepts no more loops. Out: states in which odometry factors are cut, the
-loops across them judged anew (`cuts`), with ln of their odds. Candidates are
+loops across them judged again (`cuts`), with ln of their odds. Candidates are
 
 1. the steps that a rejected loop points at: were it true and the step z slipped, the robot moved
-   by y there. Few loops may tell, and then this is all the evidence:
+   by y there. Where few loops span it, this is all the evidence:
 
        p(y as motion) p_slip(z | y) V true / (n p(z as motion) rejected)
 
@@ -59,7 +59,7 @@ from l1slam_ros.core.robust.rounds.growth import Growth
 
 # Steps that are tried by their own odds, and by loops that hardly point at them, at most.
 _TRIED = 2
-# ln of the odds of what is nearly sure, and of a slip that makes a map doubtful.
+# ln of the odds of near certainty, and of a slip that makes a map doubtful.
 _SURE = float(np.log(1 / DOUBT - 1))
 _DOUBTFUL = float(np.log(1 / CONFIDENT - 1))
 # Pairs of a loop and a step that are worked out together, to bound the memory.
