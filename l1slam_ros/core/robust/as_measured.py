@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A graph as it is told -> as it was measured: each loop once, with the noise that was meant.
+Judge a graph with each loop once, and with estimated noise where none was meant.
 
-In: what judges a graph. Out: the same for a graph that gives loops twice, or from either end, or
-states noise that nobody meant, as where each information is the identity.
+In: a function that judges a graph. Out: the same for graphs that list loops twice, or from either
+end, or state placeholder noise, such as identity information.
 """
 
 from collections.abc import Callable
@@ -31,25 +31,26 @@ from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.places import first_told
 from l1slam_ros.core.robust.rounds.growth import Growth
 
-# Noise of odometry in units of what it states, in variance: with less nobody meant that, and it is
-# taken for that much. For what was found, loops with more than normal errors would be lost.
+# Ratio of estimated to stated variance of odometry, below which the latter is a placeholder,
+# replaced by the estimate over this ratio. By the estimate itself, loops with larger than normal
+# errors would be lost.
 _OVERSTATED = 0.1
-# [rad^2/m^2] Where a file says of a radian what it says of a metre, its variance is taken for so
-# many times that of a metre until it was found: a tenth to a hundredth is usual.
+# [rad^2/m^2] Initial ratio of variances of rotation and translation where a file states one
+# number: a tenth to a hundredth is usual.
 _TURN = 1 / 30
 
-# What a factorisation, or numbers beyond double precision, end in.
+# Errors of a factorisation, or of numbers beyond double precision.
 FAILURES = (GraphError, np.linalg.LinAlgError)
 
-# From the round and the loops accepted so far.
+# Called with the round and the number of accepted loops.
 OnRound = Callable[[int, int], None]
-# A judgement, and the map (n, p) of what it accepts.
+# A judgement, and the map (n, p) it accepts.
 Believed = tuple[Judgement, Array]
 Judge = Callable[[FactorGraph, OnRound, Callable[[], None], Believed | None], Believed]
 
 
 def as_measured(judge: Judge) -> Callable[..., Believed]:
-    """Return what judges a graph as it was measured; see `batch.robust_solve`."""
+    """Return a judge of graphs with repeated loops or placeholder noise."""
     @wraps(judge)
     def judged(graph: FactorGraph, report: OnRound = lambda round_, accepted: None,
                check: Callable[[], None] = lambda: None,
@@ -69,10 +70,10 @@ def as_measured(judge: Judge) -> Callable[..., Believed]:
 def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable[[], None],
               known: Believed | None) -> Believed:
     """
-    Return the judgement of a graph, by the noise that was found where it states far too much.
+    Return the judgement of a graph, by estimated noise where the stated is far too large.
 
-    By what is stated there, far too many loops that are off fit by chance. Where it states the
-    identity, a radian is no metre either: what each is worth is found, and weighs the map.
+    By the stated noise too many outliers would fit. With the identity, radians weigh as metres:
+    the variance of each is estimated, and weights the map.
     """
     meant = np.ones((2, graph.manifold.TANGENT_SIZE))
     has_absolute = graph.between.is_absolute.any()
@@ -92,16 +93,16 @@ def _as_meant(judge: Judge, graph: FactorGraph, report: OnRound, check: Callable
     except FAILURES as error:
         return judgement.broken_off(graph, error), poses
     judgement, poses = judge(weighed(graph, meant), report, check, None)
-    # What odometry states stays as large, so that the next of it is worth as much.
+    # Odometry keeps its stated variance, in the mean, so that later odometry weighs as much.
     times = np.exp(np.log(meant).mean(axis=1))
     return replace(judgement, variance=judgement.variance * times, meant=meant / times[0]), poses
 
 
 def _stays(graph: FactorGraph, judgement: Judgement) -> bool:
     """
-    Return whether what is accepted fits by the noise found, too, but for one in a hundred.
+    Return whether accepted loops stay so by the estimated noise, but for one in a hundred.
 
-    No, too, where that cannot be told: sigmas are of no more than some hundred times this noise.
+    False also where undecidable: sigmas are in units of at most some hundred times this noise.
     """
     factors = graph.between
     gate = student_quantile(1 - BY_CHANCE, factors.freedom, graph.manifold.TANGENT_SIZE)
@@ -111,11 +112,10 @@ def _stays(graph: FactorGraph, judgement: Judgement) -> bool:
 
 def identity_roots(graph: FactorGraph) -> Array:
     """
-    Return the roots of the information of odometry and of loops where all state the identity.
+    Return the roots of identity information, diagonals of odometry and of loops, (2, k).
 
-    (2, k), the diagonals; NaN where a kind states something else, or there is none. An identity
-    that was read as information of quaternions is 1/4 for angles: their vector part is half of
-    the angle.
+    NaN where a kind states something else, or is absent. An identity read as information of
+    quaternions is 1/4 for angles: their vector part is half of the angle.
     """
     factors, manifold = graph.between, graph.manifold
     found = np.full((2, manifold.TANGENT_SIZE), np.nan)
@@ -129,7 +129,7 @@ def identity_roots(graph: FactorGraph) -> Array:
 
 
 def _by_number(graph: FactorGraph, judgement: Judgement, poses: Array) -> Array:
-    """Return the variance of odometry and of loops, of moves and of turns, as found, (2, k)."""
+    """Return the estimated variance of odometry and loops, by translation and rotation, (2, k)."""
     growth = Growth(straightened(graph, judgement.drift))
     growth.resume(poses, judgement.accepted, judgement.variance)
     rows = np.flatnonzero(growth.accepted)

@@ -7,24 +7,23 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The audit of a robust solve: each place is left out in turn, and predicted by all else.
+Audit a robust solve: leave each place out and predict it from all else.
 
-In: the end of the rounds. Out: the same without the places that all else speaks against, with
-those refused ones that explain more than they cost; and the maps that may be right in its place.
+In: the end of the rounds. Out: the same without places that all else contradicts, with rejected
+ones that explain more than they cost; and alternative maps.
 
-A place may be one mistake d, k numbers, by which all its loops are displaced alike, B d. With the
-residuals r of its loops and their covariance R by the noise, all else says of d
+A place may have one error d, k numbers, that displaces all its loops, by B d. With the residuals r
+of its loops and their covariance R by the noise, all else determines d:
 
     M = B'RB,   d = -M^-1 B'r,   square = d'Md,   covariance C = M^-1
 
 If the place is true, d has Student's distribution with this covariance, with more degrees of
-freedom the more accepted places show how large the noise is. If it is false, d is uniform over
-the volume that a loop may claim; or its size is unknown, ln of it uniform from that of C to that
-volume. What share of the false places is of the latter kind, and how many places are false, is
-found from all places, accepted and refused (expectation and maximisation): the odds are a logistic
-of how easily a place would fit by chance and of how many loops agree at it.
+freedom the more accepted places show the noise. If false, d is uniform over the claimed volume; or
+of unknown size, ln of it uniform from that of C to that volume. The share of the latter, and the
+odds of a false place, are estimated from all places, accepted and rejected (EM): a local false
+discovery rate, logistic in how easily the place would fit by chance and in its number of loops.
 
-The former density decides what is in the map; both together say how sure that is.
+The former density decides acceptance; both together give the confidence.
 """
 
 from collections.abc import Callable
@@ -44,17 +43,17 @@ from l1slam_ros.core.robust.judgement import OTHER_MAP, UNCONFIRMED
 from l1slam_ros.core.robust.rounds.evidence import Evidence
 from l1slam_ros.core.robust.rounds.growth import Growth
 
-# An accepted place goes if it is less likely true than this, ln of odds; else it is a doubt.
+# Log odds of being true below which an accepted place is dropped; else it is a doubt.
 _CLEARLY_FALSE = -float(np.log(1 / DOUBT - 1))
-# ln of the ratio below which a refused place is not tried.
+# Log ratio below which a rejected place is not tried.
 _LEAST = -15.0
-# A place less likely than this, ln of odds, may be what is false where another one is.
+# Log odds of being true below which a place may be the false one instead of another.
 _RIVAL = 3.0
-# So many places are dropped, refused ones tried, and taken; a drop is settled in so many.
+# Limits: places dropped, rejected ones tried, and accepted; drops after a trial.
 _DROPPED, _TRIED, _TAKEN, _SETTLED = 12, 3, 4, 3
-# Where a lie fits as often as that by chance, nothing else tells of the place.
+# A place that outliers would fit more often than this is not checked by others.
 _UNTOLD = 0.5
-# Weights of the odds are drawn to these, so much; each loop more makes a place likelier.
+# Ridge and prior mean of the logistic weights; each further loop makes a place likelier.
 _RIDGE, _CENTRE = np.array([0.0, 0.5, 0.5]), np.array([0.0, 0.0, -1.0])
 _ROUNDS, _NEWTON, _NEVER = 50, 3, 99
 
@@ -62,13 +61,20 @@ _ROUNDS, _NEWTON, _NEVER = 50, 3, 99
 @dataclass(frozen=True)
 class Places:
     """
-    Places of loops as all else sees them.
+    Places of loops as predicted by all else.
 
-    number : (p,) as `Evidence.place`; accepted : (p,) bool; count : (p,) of loops; ratio, mixed :
-    (p,) ln of p(d if true) / p(d if false), false ones being uniform, or that or of unknown size;
-    odds : (p,) ln of false to true among such places; information : (p, k, k) M, NaN where all
-    else says too little of d; alone : (p,) bool, nothing else tells of it; agrees : (p,) bool, the
-    loops agree but for a common error; rows, of : (m,) loops, and which place each is of.
+    Attributes
+    ----------
+    number : (p,) as `Evidence.place`
+    accepted : (p,) bool
+    count : (p,) of loops
+    ratio, mixed : (p,) ln p(d | true) / p(d | false), false ones uniform, or also of unknown size
+    odds : (p,) prior ln (false / true)
+    information : (p, k, k) M, NaN where hardly constrained
+    alone : (p,) bool, accepted but not checked by others
+    agrees : (p,) bool, loops agree but for a common error
+    rows, of : (m,) loops, and the place of each
+
     """
 
     number: Indices
@@ -85,12 +91,12 @@ class Places:
 
     @property
     def likely(self) -> Array:
-        """Ln of the odds of each to be true, (p,); against one that is alone nothing speaks."""
+        """Log odds of each to be true, (p,); infinite if alone."""
         return np.where(self.alone, np.inf, self.ratio - self.odds)
 
     @property
     def least_likely(self) -> list[int]:
-        """The accepted place that is least likely true, if clearly false, and the next; or []."""
+        """The least likely accepted place, if clearly false, and the next; or []."""
         likely = np.where(self.accepted, self.likely, np.inf)
         order: list[int] = np.argsort(likely, kind='stable')[:2].tolist()
         return order if order and likely[order[0]] <= _CLEARLY_FALSE else []
@@ -105,7 +111,7 @@ class Places:
 
 
 def places_of(growth: Growth) -> Places:
-    """Return all places that may be predicted, of accepted loops and of refused ones."""
+    """Return all places that can be predicted, of accepted loops and of rejected ones."""
     given = growth.given
     k = given.graph.manifold.TANGENT_SIZE
     may_lie = (given.is_loop & ~given.trusted & ~given.factors.is_absolute & ~growth.cut
@@ -124,12 +130,12 @@ def places_of(growth: Growth) -> Places:
     square = (np.einsum('pij,pi->pj', axes, b)**2 / lam).sum(axis=1)
     log_det = -np.log(lam).sum(axis=1)
     claim = float(claimed_volume(given.graph.manifold, growth.poses).sum())
-    # The noise is known as well as accepted places show it, of an accepted one all others.
+    # The degrees of freedom grow with the number of other accepted places.
     shown = int(np.count_nonzero(accepted))
     true, peak = (np.where(accepted, *(log_likelihood_ratio(
         at, log_det, np.zeros(1), np.full(len(at), k), k, min(max(n, 1), TAIL))
         for n in (shown, shown + 1))) for at in (square, 0 * square))
-    # On a map that knows less than a lie could claim, a lie claims as much as that.
+    # Where the map is less certain than the claimed volume, outliers fill its uncertainty.
     wide = np.maximum(claim, -peak)
     ratio, near = true + wide, _log_near(square, log_det, wide, peak, k) - true
     gate = float(given.gate(np.array([k]))[0])
@@ -148,7 +154,7 @@ def places_of(growth: Growth) -> Places:
 
 def _summed(growth: Growth, rows: Indices, said: Callable[..., tuple[Array, Array, Array]]
             ) -> tuple[Indices, Indices, Indices, Array, Array, Array]:
-    """Return numbers, firsts, the place of each loop, M, b and r'C^-1 r of places."""
+    """Return numbers, first loops, the place of each loop, M, b and r'C^-1 r of places."""
     k = growth.given.graph.manifold.TANGENT_SIZE
     number, first, of = np.unique(growth.given.place[rows], return_index=True,
                                   return_inverse=True)
@@ -159,7 +165,7 @@ def _summed(growth: Growth, rows: Indices, said: Callable[..., tuple[Array, Arra
 
 
 def _carried(growth: Growth, rows: Indices, first: Indices) -> Array:
-    """Return what a step at the end of the first loop of a place is at those of all, (m, k, k)."""
+    """Return adjoints from the end of the first loop of a place to those of all, (m, k, k)."""
     manifold, high = growth.given.graph.manifold, growth.given.high
     poses = with_world(manifold, growth.poses)
     return manifold.adjoint(manifold.between(poses[high[rows]], poses[high[first]]))
@@ -183,7 +189,7 @@ def _accepted(growth: Growth, rows: Indices, of: Indices, n: int, carried: Array
 
 def _refused(growth: Growth, rows: Indices, of: Indices, n: int, carried: Array
              ) -> tuple[Array, Array, Array]:
-    # C = I + Y Y' by samples, of all loops of a place together.
+    # C = I + Y Y' by samples, of all loops of a place jointly.
     system, q = growth.innovations(rows).system, kernels.prediction.SAMPLES
     k = system.block_size
     B, r = system.blocks[:, 1] @ carried, system.b.reshape(-1, k)
@@ -198,7 +204,7 @@ def _refused(growth: Growth, rows: Indices, of: Indices, n: int, carried: Array
     inner[at] = (own * weighed[:, :, k:])[:, :, 0].sum(axis=1)
     if single.all():
         return M, b, inner
-    # Of several the inverse of C is that of a matrix of the samples (M. A. Woodbury).
+    # Of several, C is inverted by a matrix of the samples (M. A. Woodbury).
     several, of = np.unique(of[~single], return_inverse=True)
     B, r, Y = B[~single], r[~single], Y[~single]
     Bt, Yt = B.transpose(0, 2, 1), Y.transpose(0, 2, 1)
@@ -214,10 +220,10 @@ def _refused(growth: Growth, rows: Indices, of: Indices, n: int, carried: Array
 
 def _log_near(square: Array, log_det: Array, wide: Array, peak: Array, k: int) -> Array:
     """
-    Return ln of the density of mistakes whose size is unknown, (p,), nowhere above `peak`, (p,).
+    Return ln of the density of errors of unknown size, (p,), nowhere above `peak`, (p,).
 
-    ln of the size is uniform from that of the covariance to that of what a lie may claim, which
-    is Student's distribution with no degree of freedom, ended at that size, L:
+    ln of the size is uniform from that of the covariance to that of the claimed volume: Student's
+    distribution without degrees of freedom, truncated at that size, L:
 
         p(d) = (1 + square / k)^(-k/2) / (|C|^(1/2) k^(k/2) S ln(1 + L^2) / 2)
 
@@ -231,11 +237,11 @@ def _log_near(square: Array, log_det: Array, wide: Array, peak: Array, k: int) -
 
 def _local_odds(ratio: Array, near: Array, chance: Array, count: Indices) -> tuple[Array, Array]:
     """
-    Return ln p(d if true) / p(d if false) and ln (false / true) of each place, (p,) each.
+    Return ln p(d | true) / p(d | false) and ln (false / true) of each place, (p,) each.
 
-    By expectation and maximisation, see above, also of the share of lies of unknown size.
+    By EM, see the module, also of the share of unknown size.
 
-    ratio : as if lies were uniform; near : ln p(d of unknown size) / p(d if true)
+    ratio : with uniform outliers; near : ln p(d of unknown size) / p(d | true)
     """
     if not len(ratio):
         return ratio, ratio
@@ -251,7 +257,7 @@ def _local_odds(ratio: Array, near: Array, chance: Array, count: Indices) -> tup
         for _ in range(_NEWTON):
             p, one = probability(X @ w), float(probability(w[:1])[0])
             slope = X.T @ (false - p) - _RIDGE * (w - _CENTRE)
-            slope[0] += 1 - 2 * one  # one place of each kind is added
+            slope[0] += 1 - 2 * one  # one pseudo-place of each kind
             bend = (X.T * (p * (1 - p))) @ X + np.diag(_RIDGE + TINY)
             bend[0, 0] += 2 * one * (1 - one)
             w = w + np.clip(np.linalg.solve(bend, slope), -2, 2)
@@ -262,7 +268,7 @@ def _local_odds(ratio: Array, near: Array, chance: Array, count: Indices) -> tup
 
 
 class _Vouched(Evidence):
-    """Evidence of which some loops stay accepted while others go."""
+    """A prepared graph with some loops trusted while others go."""
 
     vouched: Mask
 
@@ -272,7 +278,7 @@ class _Vouched(Evidence):
 
 
 def audit(growth: Growth) -> tuple[Growth, Places, list[Alternative]]:
-    """Return the state after the audit, its places, and the maps that were tried beside it."""
+    """Return the state after the audit, its places, and alternatives that were tried."""
     growth = _with_uncontested(growth)
     others = _drop(growth)
     places, taken = places_of(growth), 0
@@ -305,9 +311,9 @@ def audit(growth: Growth) -> tuple[Growth, Places, list[Alternative]]:
 
 def _with_uncontested(growth: Growth) -> Growth:
     """
-    Return a state with the loops that are left out, where all fit the map and each other.
+    Return a state with all rejected loops, where they fit the map and each other.
 
-    Then nothing is an outlier but by the prior: the likelier map has them.
+    Then they are outliers by the prior alone, and the likelier map has them.
     """
     given = growth.given
     rows = np.flatnonzero(given.is_loop & ~growth.accepted)
@@ -323,7 +329,7 @@ def _with_uncontested(growth: Growth) -> Growth:
 
 
 def _drop(growth: Growth) -> list[Alternative]:
-    """Drop, one by one, what all else speaks against; return what may be true for all that."""
+    """Drop clearly false places one by one; return alternatives where they are true."""
     dropped: list[Indices] = []
     others: list[Alternative] = []
     for _ in range(2):
@@ -351,7 +357,7 @@ def _drop(growth: Growth) -> list[Alternative]:
 
 def _instead(one: Growth, before: Growth, places: Places, place: int, other: int
              ) -> list[Alternative]:
-    """Return the map in which another place than the one that was dropped is false."""
+    """Return the map in which another place than the dropped one is false."""
     two, loops = before, places.loops(other)
     two.accepted[loops] = False
     two.solve()
@@ -361,14 +367,14 @@ def _instead(one: Growth, before: Growth, places: Places, place: int, other: int
 
 
 def _likely(state: Growth, number: int) -> float:
-    """Return ln of the odds of an accepted place to be true; one that is not: hardly."""
+    """Return the log odds of an accepted place to be true; else `_LEAST`."""
     places = places_of(state)
     at = np.flatnonzero(places.accepted & (places.number == number))
     return float(places.likely[at[0]]) if len(at) else _LEAST
 
 
 def _again(growth: Growth) -> None:
-    """Learn the noise of what is left, and let in what fits by that."""
+    """Estimate the noise again, and accept what fits by it."""
     growth.noise = replace(growth.noise, at_their_word=False).forgotten()
     growth.learn_noise_anew()
     growth.accept_more()
@@ -378,7 +384,7 @@ def _again(growth: Growth) -> None:
 
 
 def _taken(growth: Growth, loops: Indices) -> tuple[Growth, Places]:
-    """Return the state in which some refused loops are true, and others go or come for them."""
+    """Return the state with some rejected loops as true, and others updated."""
     state, given = growth.copy(), growth.given
     vouched = _Vouched(**{one.name: getattr(given, one.name) for one in fields(Evidence)})
     mask = given.factors.trusted.copy()
@@ -394,7 +400,7 @@ def _taken(growth: Growth, loops: Indices) -> tuple[Growth, Places]:
 
 
 def _settle(state: Growth) -> Places:
-    """Drop what all else speaks against, a few; return the places."""
+    """Drop a few clearly false places; return the places."""
     for number in range(_SETTLED + 1):
         places = places_of(state)
         if number == _SETTLED or not (least := places.least_likely):
@@ -409,13 +415,13 @@ def _settle(state: Growth) -> Places:
 
 def alternatives(growth: Growth, map_: Drawn, places: Places, known: list[Alternative]
                  ) -> list[Alternative]:
-    """Return the maps where one place is not what it is taken for, but for those known."""
+    """Return the maps with one place accepted or rejected instead, but for known ones."""
     true = places.mixed - places.odds
     odds = np.where(places.accepted, -true, true)
     known_places = np.unique(np.concatenate([places.of[np.isin(places.rows, one.loops)]
                                              for one in known] or [np.zeros(0, np.int64)]))
     odds[known_places[~places.accepted[known_places]]] = -np.inf
-    # What leads across a slip alone is as likely as that.
+    # A place that alone spans a slip is covered by the alternative of the slip.
     for step in np.flatnonzero(growth.cut & ~growth.given.gap).tolist():
         across = np.unique(places.of[growth.given.spanning(step)[places.rows]])
         odds[across[places.alone[across]]] = -np.inf

@@ -7,33 +7,31 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Maps that survive lies: which loops are inliers, and how sure that is.
+Robust solve: which loops are inliers, and with what confidence.
 
-In: a graph, of which nothing is accepted but the odometry and the trusted loops. Out: the loops
-that are accepted, their L2 map, and what speaks against it. The model, and what is done with it:
+In: a graph, with only odometry and trusted loops accepted. Out: the accepted loops, their L2 map,
+and its doubts. Model and algorithm:
 
-1. Noise. What a file states of its noise may be off by a constant for each kind, odometry or
-   loops, and number: moves and turns, in space those of the floor and of the height apart. It is
-   found from the innovations of all loops (`gating.noise_variance`), then again from the
-   residuals of what is accepted (`rounds`).
-2. Rounds. A true loop has an innovation r with a covariance C by samples of the map
-   (`innovation`): r'C^-1 r passes the gate. A false one is uniform over the extent of the map
-   and all rotations. How many are false is found from the loops (empirical Bayes, `gating`).
-   What is accepted at one time is false with a probability of 1% at most; then the map is solved
-   anew, until nothing changes. Loops of one place (`places`) may be one mistake: together they
-   count once.
-3. Parts. What lies beyond a gap of the odometry is joined where loops of two places agree
+1. Noise. Stated variances may be off by a constant for each kind, odometry or loops, and
+   component: translation and rotation, in space those of the floor and of the height apart. It is
+   estimated from innovations of all loops (`gating.noise_variance`), then from residuals of
+   accepted factors (`rounds`).
+2. Rounds. The innovation r of an inlier, with covariance C by posterior samples (`innovation`),
+   passes a gate on r'C^-1 r. Outliers are uniform over the extent of the map and all rotations, at
+   a rate estimated from the loops (empirical Bayes, `gating`). Loops accepted together include an
+   outlier with a probability of 1% at most; then the map is solved again, until nothing changes.
+   Loops of a place (`places`) may share one error: together they count once.
+3. Parts. Both sides of an odometry gap are joined where loops of two places agree
    (`pairwise_consistency`).
-4. Hypotheses. Where loops do not fit, the odometry drifts, the same on each metre (`drift`), a
-   step of it slipped (`slips`), or it is noisier along a run of loops (`hypotheses`): the
-   likeliest is taken where ln of its odds is above 0 (`repair`). Then again from 2.
-5. Audit. Each place is predicted by all else (`audit`): what is clearly false goes, what is
-   refused and explains more than it costs comes in.
-6. Confidence. Each map that may be right in place of the one found, with its odds, and how
-   likely the one found is wrong then (`confidence`). Below 90% it is doubtful, and these are the
-   doubts; another norm is one below 80%.
+4. Hypotheses. Where loops do not fit, the odometry drifts, by a constant for each metre (`drift`),
+   steps of it slipped (`slips`), or it is noisier along a run of loops (`hypotheses`): the
+   likeliest is accepted where its log odds are positive (`repair`). Then again from 2.
+5. Audit. Each place is predicted by all else (`audit`): clearly false ones are dropped, rejected
+   ones that explain more than they cost accepted.
+6. Confidence. Alternative maps have odds, and a probability that the map is wrong if they are
+   right (`confidence`). Below 90% it is doubtful, with these doubts; below 80% by its norm alone.
 
-No loop is factored before it is accepted, so none bends what it is judged by.
+No loop is a factor before it is accepted, so none bends the map that tests it.
 """
 
 from collections.abc import Callable, Iterator
@@ -77,7 +75,7 @@ from l1slam_ros.core.solvers.optimality import Status, l1_cost
 
 # Below, a map is doubtful by its norm alone: its posterior takes the noise for independent.
 _SURE_OF_NORM = 0.8
-# Every round accepts a loop, hence there is an end; this one is for the patience of people.
+# Each round accepts a loop, so they end; this bounds the time.
 _MOST_ROUNDS = 200
 
 
@@ -88,17 +86,12 @@ def robust_solve(
     check: Callable[[], None] = lambda: None, known: Believed | None = None,
 ) -> Believed:
     """
-    Return which loops to accept, from the graph alone, and the L2 map (n, p) of these.
+    Return which loops to accept, from the graph alone, and their L2 map (n, p).
 
-    Where that fails, what was believed so far, doubtful: loops that nobody judged are never taken
-    for true.
+    On failure, those accepted before, doubtful; loops that were not judged never.
 
-    Parameters
-    ----------
-    report : called with the round and the loops accepted so far
-    check : called before long steps, raises where the work shall stop
-    known : what was believed before and stays if this fails; None: what was in the last round
-
+    report : called with the round and the number of accepted loops; check : called before long
+    steps, raises to stop; known : result on failure, None: that of the last round
     """
     first = growth = Growth(graph, check)
     last = so_far(first), first.poses
@@ -122,7 +115,7 @@ def robust_solve(
 
 @dataclass(frozen=True)
 class RobustMap:
-    """The map of the accepted factors, the L2 map (n, p) it began with, the judgement on all."""
+    """The map of accepted factors, the L2 map (n, p) it began with, the judgement."""
 
     solution: Solution
     seed: Array
@@ -135,10 +128,9 @@ def minimise_robustly(
     known: Believed | None = None,
 ) -> RobustMap:
     """
-    Return the map that `minimise` makes of the factors that are accepted.
+    Return the map that `minimise` makes of accepted factors, else their L2 map.
 
-    They are judged in L2, which spreads a doubt over all factors near it, where L1 leaves it on a
-    few. Where it cannot be made, the map by which they were judged.
+    Loops are judged in L2, which spreads an error over all factors near it; L1 leaves it on a few.
 
     minimise : from a graph and poses (n, p) to its solution; report, check, known : see
     `robust_solve`
@@ -161,7 +153,6 @@ def minimise_robustly(
 
 
 def _standing(graph: FactorGraph, poses: Array) -> Solution:
-    """Return poses (n, p) as a solution that nothing was found by."""
     residual = whitened_residual(graph, poses)
     cost = l1_cost(residual)
     return Solution(poses, cost, Status.STALLED, 0, 0, np.array([cost]), np.zeros(len(residual)))
@@ -175,7 +166,7 @@ def _unsolved(graph: FactorGraph, judgement: Judgement, error: Exception) -> Dou
 def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
                    check: Callable[[], None]) -> tuple[Doubt, ...]:
     """Return the doubts that `minimise_robustly` would have of a map, (n, p), by its norm."""
-    if not len(graph.between):  # of nothing: compiled loops would go past its arrays
+    if not len(graph.between):  # compiled loops would run past empty arrays
         return ()
     try:
         whole, seed = _least_squares(graph, judgement, poses, check)
@@ -187,7 +178,6 @@ def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
 
 def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,
                    check: Callable[[], None]) -> tuple[FactorGraph, Array]:
-    """Return the accepted factors, in one piece, and their L2 map (n, p), from poses (n, p)."""
     whole = tied(judgement.believed(graph), poses)
     return whole, l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
 
@@ -195,11 +185,11 @@ def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,
 def _sure_of_norm(graph: FactorGraph, judgement: Judgement, whole: FactorGraph, seed: Array,
                   poses: Array) -> float:
     """
-    Return how likely a map, (n, p), is right by what its norm makes of the accepted factors.
+    Return how likely the map of a norm, (n, p), is right.
 
-    Where these have normal noise, as it was found, the truth is about their L2 map.
+    With normal noise, as estimated, the truth is about the L2 map.
 
-    whole, seed : see `_least_squares`
+    whole, seed : accepted factors with parts tied, and their L2 map
     """
     noise = judgement.found_variance(graph)
     noise = np.concatenate((noise, np.ones(len(whole.between) - len(noise))))
@@ -219,10 +209,10 @@ def rounds(
     growth: Growth, repaired: Callable[[Growth, Growth], Growth | None] | None = None
 ) -> Iterator[Growth]:
     """
-    Yield the state after each round, until there is nothing more to accept.
+    Yield the state after each round, until nothing more is accepted.
 
-    repaired : asked in the end for another state, from the one with the noise as it was found and
-    the one where all may be as noisy as they say; None: there is none, or nobody looks for one.
+    repaired : returns a state to continue from, or None, given the last states by estimated noise
+    and by max(estimated, stated)
     """
     found = None
     for _ in range(_MOST_ROUNDS):
@@ -248,9 +238,9 @@ def rounds(
 def judged(growth: Growth, places: Places, others: list[Alternative], ended: bool = True
            ) -> Judgement:
     """
-    Return what a state says of the factors that were given, and how sure that is.
+    Return the judgement of the given factors, with confidence and doubts.
 
-    others : maps that were tried beside it; ended : nothing more can be accepted
+    others : alternatives that were tried; ended : nothing more can be accepted
     """
     graph, given = growth.given.graph, growth.given
     map_ = drawn(growth)
@@ -275,7 +265,7 @@ def judged(growth: Growth, places: Places, others: list[Alternative], ended: boo
 
 
 def doubt_about(growth: Growth, other: Alternative) -> Doubt:
-    """Return the doubt of a map that another one may be right in place of it."""
+    """Return the doubt that an alternative is right."""
     given = growth.given
     doubt = doubt_of(given.graph, other.loops[other.loops < given.size], other.kind, other.detail)
     if other.step >= 0:
@@ -284,13 +274,13 @@ def doubt_about(growth: Growth, other: Alternative) -> Doubt:
 
 
 def slips(growth: Growth) -> list[Alternative]:
-    """Return the maps where an odometry factor slipped that is not cut, or did not that is."""
+    """Return alternatives where a cut odometry factor did not slip, or another did."""
     given, found = growth.given, []
     for step, odds in growth.slip_odds.items():
         span = given.spanning(step)
         across = growth.accepted & span
         if across.any() and given.trusted[across].all():
-            continue  # a person says where the robot went
+            continue  # a person vouches for the motion
         found.append(Alternative(SLIP, np.flatnonzero(across if across.any() else span),
                                  -odds if growth.cut[step] else odds, step=step))
     return found
@@ -298,10 +288,10 @@ def slips(growth: Growth) -> list[Alternative]:
 
 def agreeing(growth: Growth) -> list[Alternative]:
     """
-    Return the map of refused loops of several places that agree, or of a long run across a gap.
+    Return the map of rejected loops of places that agree, or of a long run across a gap.
 
-    Several places span a step of the odometry that no accepted loop does: it slipped there, or as
-    many are lies that agree. Across a gap loops alone speak for either. Both are as likely.
+    Several places span an odometry step that no accepted loop does: it slipped, or they are
+    outliers that agree. Across a gap only loops are evidence. Either is as likely.
     """
     given, rows, accepted = growth.given, growth.undecided(), growth.loops
     across = spanned(given.low[accepted], given.high[accepted], given.graph.n_poses)
@@ -321,16 +311,12 @@ def judge(
     check: Callable[[], None] = lambda: None,
 ) -> Believed:
     """
-    Return what is to be accepted, after looking again at all loops that are not, and its L2 map.
+    Return the judgement after testing rejected loops again, and its L2 map.
 
-    A slip of the odometry is not looked for: that takes too long to do while driving. Where it
-    fails, what is known stays, doubtful.
+    Slips are not searched for: that takes too long while driving. On failure `known` stays,
+    doubtful.
 
-    Parameters
-    ----------
-    poses : (n, p) the map of what was accepted
-    check : called before long steps, raises where the work shall stop
-
+    poses : (n, p) the map of accepted factors; check : see `robust_solve`
     """
     first = Growth(known.corrected(graph), check)
     try:

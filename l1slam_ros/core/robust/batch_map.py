@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A whole graph -> its map, in the norm that was asked for, loops doubted or believed.
+Solve a whole graph in a given norm, robustly or with all loops.
 
-In: a graph, the poses that are stored with it, if any, and how it is to be solved. Out: the
-solution, what found it, and what is believed of the loops.
+In: a graph, its stored poses, if any, and options. Out: the solution, its solver, and the
+judgement of the loops.
 """
 
 import time
@@ -52,17 +52,16 @@ from l1slam_ros.core.solvers.solve import (
     norm_for,
 )
 
-# A graph with more gaps than this part of its steps is none of a robot that kept its odometry.
+# With more gaps than this part of its steps, a graph has no usable odometry.
 _MOST_GAPS = 0.1
 
 
 @dataclass(frozen=True)
 class SolveOptions:
     """
-    How a graph is to be solved; see `core.names`.
+    Options of a solve; see `core.names`.
 
-    solver : for L1; robust : refuse loops that cannot be believed; None: where the graph is one
-    whose loops can be judged.
+    solver : for L1; robust : reject outlier loops, None: if there is odometry to judge them by
     """
 
     start: str = 'seed'
@@ -77,12 +76,17 @@ class SolveOptions:
 @dataclass(frozen=True)
 class Outcome:
     """
-    What `solve` did; costs are of the norm that was asked for, seed_cost None without one.
+    Result of `solve`; costs are in the given norm.
 
-    solver : what found the solution, by its name; reason : a clause that says why it; judgement :
-    of a robust solve, whose costs count the accepted factors; unjudged : why there is none though
-    nobody said so, else empty; parts : of the graph, joined by nothing that is believed; offset :
-    see `shared_offset`.
+    Attributes
+    ----------
+    solver, reason : its name, and a clause why
+    seed_cost : None without a seed
+    judgement : of a robust solve, whose costs count accepted factors
+    unjudged : why loops were not judged though options allow it, else empty
+    parts : number of connected components
+    offset : see `shared_offset`
+
     """
 
     solution: Solution
@@ -108,22 +112,22 @@ def solve(
 
     Parameters
     ----------
-    stored : (n, p) the poses to start from with `start='file'`, and where the initial cost is
-        taken; None: those of the odometry, or where it has gaps, of a tree
+    stored : (n, p) poses to start from with `start='file'`, and of the initial cost; None: those
+        of the odometry, or with gaps, of a tree
     report : called with each iteration and its cost
     on_round : see `robust_solve`
-    ids : (n,) what errors call the keyframes; None: their numbers
-    on_choice : called with what the map is solved by, before that is done
+    ids : (n,) names of keyframes in errors; None: their numbers
+    on_choice : called with the method
 
     Raises
     ------
-    GraphError : the graph has no such start, or numbers beyond all measure; or it is not connected
-        and loops are not to be judged.
+    GraphError : the graph lacks this start, or its numbers leave double precision; or it is not
+        connected and loops are not to be judged.
 
     """
     ids = np.arange(graph.n_poses) if ids is None else ids
     whole = graph
-    graph = graph.without_struck()  # what is struck out is there for nobody
+    graph = graph.without_struck()  # struck factors are never used
     initial = _initial(graph, stored, asked, ids)
     seed = None
     minimiser = _Minimiser(asked, report, on_choice)
@@ -144,7 +148,7 @@ def solve(
 
     seed_cost = None if seed is None else cost(seed)
     if robust:
-        # Whatever the noise is, and whatever failed: of the norm, by what the file says of it.
+        # Cost in the given norm with stated noise, whatever was assumed or failed.
         solution = replace(solution, cost=cost(solution.poses))
     if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
         raise GraphError('the cost leaves double precision: measurements and information of the '
@@ -157,7 +161,7 @@ def solve(
 
 
 def _seed(graph: FactorGraph, method: Method) -> Array:
-    """Return the poses that a solve begins with; the paper's Algorithm 4 by its Algorithm 3."""
+    """Return the initial poses of a solve; for the paper's Algorithm 4 by its Algorithm 3."""
     if method.cholesky is None or method.solver == PRIMAL_DUAL:
         return seed_poses(graph, method.cholesky)
     return first_poses(graph, method.cholesky)
@@ -165,8 +169,8 @@ def _seed(graph: FactorGraph, method: Method) -> Array:
 
 def _robust_map(graph: FactorGraph, asked: SolveOptions, minimiser: '_Minimiser',
                 on_round: OnRound, ids: Indices) -> tuple[RobustMap | None, str]:
-    """Return the robust map; where nobody insists on one and there is none, None and why."""
-    # No odometry leads to a robot's first keyframe, so that is no gap.
+    """Return the robust map, or None and, if the options left it open, why."""
+    # A robot's first keyframe has no odometry before it; that is no gap.
     unjudged = ''
     gaps = np.setdiff1d(odometry_gaps(graph), graph.firsts - 1)
     if asked.robust is None and len(gaps) > _MOST_GAPS * (graph.n_poses - 1):
@@ -181,7 +185,7 @@ def _robust_map(graph: FactorGraph, asked: SolveOptions, minimiser: '_Minimiser'
 
 
 class _Minimiser:
-    """Minimises the norm that was wished for; solver, reason : what did it last, and why."""
+    """Minimises the given norm; solver, reason : the last used, and why."""
 
     def __init__(self, asked: SolveOptions, report: Report, on_choice: Callable[[Method], None]):
         self._asked = asked
@@ -190,17 +194,14 @@ class _Minimiser:
         self.solver = self.reason = ''
 
     def choose(self, graph: FactorGraph) -> Method:
-        """Return what the graph is solved by."""
         method = choose(self._asked.solver, graph, self._asked.norm, self._asked.loop_norm)
         self._on_choice(method)
         return method
 
     def minimise(self, graph: FactorGraph, poses: Array) -> Solution:
-        """Return the solution from poses (n, p)."""
         return self.minimise_by(self.choose(graph), graph, poses)
 
     def minimise_by(self, method: Method, graph: FactorGraph, poses: Array) -> Solution:
-        """Return the solution by what was chosen."""
         asked = self._asked
         self.solver = method.solver
         self.reason = method.reason
@@ -211,7 +212,7 @@ class _Minimiser:
         return solution
 
     def fail(self) -> None:
-        """Note that the map is another than what was wished for."""
+        """Note that the L2 map of the judgement stands in."""
         self.solver = GAUSS_NEWTON
         self.reason = 'the loops were judged by its map'
 
@@ -237,7 +238,7 @@ def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Arr
 
 def _initial(graph: FactorGraph, stored: Array | None, asked: SolveOptions,
              ids: Indices) -> Array:
-    """Return the poses to start from, or to take the initial cost at, (n, p)."""
+    """Return the poses to start from, or of the initial cost, (n, p)."""
     way, number = by_first_sightings(graph)
     order = np.argsort(number)
     _require_start(way, stored, asked, ids[order])
@@ -249,7 +250,6 @@ def _initial(graph: FactorGraph, stored: Array | None, asked: SolveOptions,
 
 def _require_start(graph: FactorGraph, stored: Array | None, asked: SolveOptions,
                    ids: Indices) -> None:
-    """Refuse, before any work is done, a graph that is not connected or has no such start."""
     if asked.robust is False:
         require_connected(graph, ids)
     if asked.start == 'file' and stored is None:
@@ -262,6 +262,5 @@ def _require_start(graph: FactorGraph, stored: Array | None, asked: SolveOptions
 
 
 def _no_edge(ids: Indices, gaps: Indices) -> str:
-    """Return what the first gap of an odometry means."""
     return (f'no edge between the consecutive vertices {ids[gaps[0]]} and {ids[gaps[0] + 1]}, so '
             'no chain of odometry')

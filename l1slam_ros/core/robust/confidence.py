@@ -7,15 +7,15 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-How sure a map is: the maps that may be right in its place, and whether that matters.
+Confidence of a map: alternative maps, their odds, and whether they make it wrong.
 
-In: the end of an audit. Out: the alternatives, each with ln of its odds, and how likely the map
-is wrong if one of them is right.
+In: the end of an audit. Out: the alternatives with log odds, and how likely the map is wrong if
+one is right.
 
-A map is right where its error is at most 1.5 times that of the map of the true factors alone, and
-.1 m (RMSE, aligned). If an alternative is right, the truth is its map and an error drawn from its
-posterior; by samples of that follows how likely the map is wrong then, its `harm`. With
-alternatives a that are independent,
+A map is right if its error is at most 1.5 times that of the map of true factors alone, and .1 m
+(RMSE, aligned). If an alternative is right, the truth is its map plus an error drawn from its
+posterior; samples give the probability, `harm`, that the map is wrong then. With independent
+alternatives a,
 
     P(right) = product of 1 - P(a) harm(a)
 """
@@ -33,22 +33,22 @@ from l1slam_ros.core.robust.innovation import factorised, spread_of
 from l1slam_ros.core.robust.rounds.growth import Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
-# A map is right up to so many times the error of the true factors' map, and so much more [m].
+# Limit of the error of a right map: a multiple of that of the true factors' map, plus [m].
 TIMES, METRES = 1.5, 0.1
 # Below, a map is doubtful.
 CONFIDENT = 0.9
-# What is less likely than this is no alternative.
+# Alternatives less likely are ignored.
 UNLIKELY = 1e-3
-# Maps are compared at so many keyframes.
+# Maps are compared at about this number of keyframes.
 _COMPARED = 200
 
 
 @dataclass(frozen=True)
 class Drawn:
     """
-    A map at some of its keyframes, and its error there by samples of its posterior.
+    A map at some of its keyframes, with posterior samples of its error.
 
-    poses : (l, p); samples : (l, k, q); part : (l,) of which part each is
+    poses : (l, p); samples : (l, k, q); part : (l,) component of each
     """
 
     manifold: Manifold
@@ -58,18 +58,18 @@ class Drawn:
 
     @staticmethod
     def of(manifold: Manifold, poses: Array, samples: Array, part: Indices) -> 'Drawn':
-        """Return a map (n, p) by samples of all keyframes but those held fixed, part (n,)."""
+        """Return the record of a map (n, p), from samples of its free keyframes, part (n,)."""
         fixed = np.zeros((len(poses) - len(samples), *samples.shape[1:]))
         some = compared(len(poses))
         return Drawn(manifold, poses[some], np.concatenate((fixed, samples))[some], part[some])
 
     @property
     def expected(self) -> float:
-        """The error [m] that the map expects of itself."""
+        """Expected error by the posterior [m]."""
         return float(np.sqrt((self._errors(self, self._largest)**2).mean()))
 
     def harm(self, other: 'Drawn | None') -> float:
-        """Return how likely the map is wrong if another one is right, None: any."""
+        """Return how likely the map is wrong if another is right, None: any."""
         if other is None:
             return 1.0
         own = self._largest
@@ -78,11 +78,10 @@ class Drawn:
 
     @property
     def _largest(self) -> Mask:
-        """(l,) bool: of the largest part."""
         return np.asarray(self.part == np.bincount(self.part).argmax())
 
     def _errors(self, found: 'Drawn', own: Mask) -> Array:
-        """Return the error of a map, at some keyframes, if this one is right, (q,) RMSE [m]."""
+        """Return samples of the error of a map if this one is right, (q,) RMSE [m]."""
         positions, samples = self.manifold.positions, np.moveaxis(self.samples[own], 2, 0)
         poses = np.tile(self.poses[own], (len(samples), 1))
         truth = positions(self.manifold.retract(poses, samples.reshape(len(poses), -1)))
@@ -96,11 +95,17 @@ class Drawn:
 @dataclass(frozen=True)
 class Alternative:
     """
-    A map that may be right in place of the one found.
+    A map that may be right instead of the one found.
 
-    kind : see `judgement`; loops : (k,) what it is about; odds : ln P(it) / P(the map found);
-    map : it, None: any; step : the odometry factor that it is about, -1: none; detail : of the
-    doubt
+    Attributes
+    ----------
+    kind : see `judgement`
+    loops : (k,) concerned
+    odds : ln P(this map) / P(the map found)
+    map : this map, None: any
+    step : odometry factor concerned, -1: none
+    detail : of the doubt
+
     """
 
     kind: str
@@ -112,17 +117,17 @@ class Alternative:
 
     @property
     def chance(self) -> float:
-        """How likely it is."""
+        """Probability of the alternative."""
         return float(probability(np.array(self.odds)))
 
 
 def compared(n: int) -> slice:
-    """Return which of n keyframes are compared."""
+    """Return which of n keyframes to compare."""
     return slice(None, None, max(1, n // _COMPARED))
 
 
 def drawn(growth: Growth) -> Drawn:
-    """Return the map of a state, and its error by the noise that was found."""
+    """Return the map of a state, with its error by the estimated noise."""
     given = growth.given
     variance, used = growth.noise.each, growth.noise.assumed
     samples = growth.posterior.samples[:-1]
@@ -136,7 +141,7 @@ def drawn(growth: Growth) -> Drawn:
 
 
 class Shifts:
-    """Maps of a state, to first order, without a place that it accepts, or with one more."""
+    """First-order maps without an accepted place, or with one more factor."""
 
     def __init__(self, growth: Growth, map_: Drawn):
         self._growth, self._map = growth, map_
@@ -146,9 +151,9 @@ class Shifts:
 
     def without(self, at: Indices, B: Array, M: Array) -> Drawn:
         """
-        Return the map where accepted factors have one mistake d, of which all else says d'Md.
+        Return the map where accepted factors have one error d, with information M by all else.
 
-        at : (l,) the factors, among the accepted; B : (l, k, k) what d is to their residuals
+        at : (l,) the factors, among accepted; B : (l, k, k) derivatives of their residuals by d
         """
         posterior = self._growth.posterior
         gain = []
@@ -174,14 +179,13 @@ class Shifts:
         return self._moved([self._some(x) for x in whole], np.linalg.solve(S, b))
 
     def _some(self, step: Array) -> Array:
-        """Return the step of the keyframes that are compared, (l, k)."""
         poses, fixed = self._growth.poses, self._growth.posterior.fixed
         whole = np.zeros((len(poses), self._system.block_size))
         whole[fixed:] = step.reshape(len(poses) - fixed, -1)
         return whole[compared(len(poses))]
 
     def _moved(self, gain: list[Array], d: Array) -> Drawn:
-        """Return the map moved by gain d, d (k, 1 + q): of it, and of its samples."""
+        """Return the map and samples moved by gain d, d (k, 1 + q)."""
         step = np.stack(gain, axis=2) @ d
         manifold = self._map.manifold
         return replace(self._map, poses=manifold.retract(self._map.poses, step[:, :, 0]),

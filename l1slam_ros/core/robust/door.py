@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""`l1slam_ros.solve`: a graph -> its map, and which loops are in it."""
+"""`l1slam_ros.solve`: the map of a graph, and its inlier loops."""
 
 from dataclasses import dataclass
 from weakref import ReferenceType, WeakKeyDictionary, ref
@@ -21,8 +21,7 @@ from l1slam_ros.core.graph.measurements import as_poses
 from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.robust import batch_map
 
-# Of each graph the poses of its last solution, and what these were made of: who writes them writes
-# what was believed.
+# The last solution of each graph: its poses, inliers and drift, for writers of these poses.
 _LAST: WeakKeyDictionary[FactorGraph, tuple[ReferenceType[Array], Mask, float]] = (
     WeakKeyDictionary())
 
@@ -32,9 +31,14 @@ class Solution:
     """
     A solved graph.
 
-    poses : (n, p) [m, rad], the first keyframe where the start had it; cost : of the norm, over
-    the inliers; status : converged, iteration_limit, stalled, or doubtful: the loops could not be
-    told from lies, this is the best map there is; inliers : (m,) bool of the between factors.
+    Attributes
+    ----------
+    poses : (n, p) [m, rad], the first keyframe where the start had it
+    cost : in the norm, over the inliers
+    status : converged, iteration_limit, stalled, or doubtful: the best map found, but inliers and
+        outliers could not be separated
+    inliers : (m,) bool of the between factors
+
     """
 
     poses: Array
@@ -50,18 +54,17 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
 
     Parameters
     ----------
-    graph : the factors, as of `read_graph`
-    norm : l1, the sum of the absolute whitened residuals; group-l1, of the lengths of all;
-        l2, of their squares; huber
-    robust : refuse loops that cannot be believed; False: believe all
-    start : (n, p) poses to begin with; None: a seed computed from the graph alone, as a robust
-        solve does in any case
+    graph : as of `read_graph`
+    norm : l1, the sum of absolute whitened residuals; group-l1, of their lengths; l2, of their
+        squares; huber
+    robust : reject outlier loops; False: accept all
+    start : (n, p) initial poses; None: a seed computed from the graph alone, as always if robust
     loop_norm : of loops and absolute poses; same: as `norm`
 
     Raises
     ------
-    GraphError : the graph is not connected, its odometry has a gap where loops are to be
-        judged, or `start` has another shape or is not finite.
+    GraphError : the graph is not connected, its odometry has a gap where loops are to be judged,
+        or `start` has another shape or is not finite.
     OptionError : there is no such norm, or an argument is of another kind.
 
     """
@@ -99,7 +102,7 @@ def believed(graph: FactorGraph, poses: Array) -> tuple[Mask | None, float]:
     """
     Return the inliers (m,) of the last solution of a graph and the drift [rad/m] of its odometry.
 
-    Of another map than these poses are, nothing is known: None, 0.
+    None, 0 for other poses.
     """
     if graph in _LAST:
         made_of, inliers, drift = _LAST[graph]

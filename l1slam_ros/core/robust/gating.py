@@ -7,11 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Which of many factors to believe, given how well each one fits.
+Gate factors by their odds of being outliers, with the outlier rate estimated from the data.
 
-In: likelihood ratios of true against false. Out: the odds of a false one among them, and those
-that may be believed. The odds come from the factors themselves (empirical Bayes), so no share of
-false ones is assumed.
+In: likelihood ratios of inlier against outlier. Out: the odds of an outlier, and the factors to
+accept. The odds are fitted to the factors themselves (empirical Bayes); no rate is assumed.
 """
 
 from collections.abc import Callable
@@ -28,36 +27,37 @@ from l1slam_ros.core.robust.innovation import (
     log_likelihood_ratio,
 )
 
-# What squares of true factors stay below, by their freedom.
+# Bound on the squared innovations of inliers, by their degrees of freedom.
 Gate = Callable[[Indices], Array]
 
-# Of factors that are believed at one time, any is false with at most this probability. Of 89 runs
+# Bound on the probability of an outlier among factors accepted together. In 89 runs
 # (benchmarks/robust/sensitivity.py, as all such counts) half makes 4 worse, double 2.
 DOUBT = 0.01
-# The noise is judged by so many of the best predicted factors; half and double make none worse.
+# The noise is estimated from this number of the best predicted factors; half or double makes none
+# worse.
 _BEST_PREDICTED = 1000
-# What differs by no more than this part of it is the same: what rounds of expectation and
-# maximisation find, which end then; how a robot moves.
+# Relative change at which expectation maximisation, or a robot's motion, counts as unchanged.
 SAME = 1e-3
-# How much more the loops' variance may be off than the odometry's, as said or else; another ratio
-# has to make each loop likelier by so much, ln. Half and double change none, but with none FR079's
-# map by wheels is .87 m off for .73, and Intel with noise that is stated wrong loses fewer loops.
+# Candidate ratios of the noise scale of loops to that of odometry. Any but 1 costs this log
+# likelihood for each loop: half or double changes no run; without it FR079's map by wheels errs by
+# .87 m instead of .73, and Intel with misstated noise loses fewer loops.
 _RATIOS = (1.0, *(10.0**power for power in range(-6, 7) if power))
 _RATIO_COSTS = 0.25
-# Variances are no less, and no information, where they would be nothing.
+# Floor of variances and of information that may be zero.
 TINY = 1e-9
-# Pairs are formed of so many factors that fit best; half and double change 8 and 5, none is worse.
-# By 250 a recorded log, Intel, gets a slip that is none.
+# Pairs are formed of this number of the best fitting factors; half and double change 8 and 5 runs,
+# none for the worse. With 250, Intel, a recorded log, gets a false slip.
 _CANDIDATES = 200
 
 
 def log_odds_of_false(log_ratio: Array, others: int, believed: int = 0) -> float:
     """
-    Return ln (false / true) of a crowd of factors, by expectation and maximisation.
+    Return ln (false / true) of a population of factors, by expectation maximisation.
 
-    log_ratio : (m,) of those that fit; others : how many do not, all false; believed : how many
-    are true for sure. One of each kind is added, so that a crowd without a true or a false one
-    still says how sure that is.
+    A pseudo-factor of each class keeps the odds finite.
+
+    log_ratio : (m,) of factors that pass the gate; others : number that fail it, all false;
+    believed : number known to be true
     """
     count = len(log_ratio) + others + believed
     odds, before = 0.0, np.inf
@@ -79,19 +79,15 @@ def believable(
     place: Indices,
 ) -> Indices:
     """
-    Return the factors that may be believed: each by itself, else together, (k,).
+    Return the factors to accept: each on its own odds, else in pairs, (k,).
 
-    Parameters
-    ----------
-    gate : what squares of true factors stay below, by their freedom; fits : (m,) which do
-    believed : how many others are true for sure
+    gate : see `Gate`; fits : (m,) which pass it; believed : number of others known to be true;
     place : (m,) see `places`
-
     """
     log_ratio = found.log_ratio()
     odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), believed)
     log_odds = np.logaddexp(odds, rivals(found, posterior, (fits, log_ratio, odds), place))
-    # Before any is believed, or by noise that is too large, lies fit nearly as well as true ones.
+    # Before any loop is accepted, or with too large noise, outliers fit nearly as well.
     well = (found.square < gate(found.freedom) / 2) & (believed > 0)
     good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits], place[fits],
                                                  well[fits])]
@@ -102,12 +98,12 @@ def believable(
 
 def at_once(log_odds: Array, place: Indices, well: Mask) -> Indices:
     """
-    Return which may be believed, all of them at once, surest first.
+    Return the factors to accept together, surest first.
 
-    As many as are all true but for `DOUBT`. Of those that fit well, as many as no more than
-    `BY_CHANCE` of their places are expected to be false of, and `DOUBT` of one more place, so
-    that of few none is given away (the false discovery rate of Y. Benjamini and Y. Hochberg,
-    1995). A place may have been mistaken as a whole: it counts once, by its most doubtful factor.
+    As many as are all true but for `DOUBT`. Factors that fit well also pass by the false discovery
+    rate (Y. Benjamini and Y. Hochberg, 1995): the expected number of false places, plus `DOUBT`,
+    is below `BY_CHANCE` times their number; so a few places never pass. All loops of a place may
+    share one error: it counts once, by its most doubtful factor.
 
     log_odds : (m,) ln (true / false); place : (m,) see `places`; well : (m,) which fit well
     """
@@ -130,17 +126,12 @@ def at_once(log_odds: Array, place: Indices, well: Mask) -> Indices:
 def together(found: Innovations, posterior: Posterior, gate: Gate,
              alone: tuple[Mask, Array, Array], place: Indices) -> Indices:
     """
-    Return which factors may be believed by pairs, where none is sure by itself, (k,).
+    Return the factors to accept in pairs, where none is sure by itself, (k,).
 
-    To the log ratio of a that of the best factor b of another place given a is added, less the
-    log odds of b above 0: two that fit well begin a map though each may be chance.
+    The log ratio of a gains that of the best factor b of another place given a, less the log odds
+    of b if positive: two loops that agree can start a map though each may fit by chance.
 
-    Parameters
-    ----------
-    gate : what squares of true factors stay below, by their freedom
-    alone : which fit (m,), the log ratios and the log odds (m,)
-    place : (m,) see `places`
-
+    gate, place : see `at_once`, `Gate`; alone : (m,) each, which pass it, log ratios, log odds
     """
     fits, log_ratio, odds = alone
     one, other, square, both = _pairs(found, posterior, np.flatnonzero(fits), log_ratio, place)
@@ -156,12 +147,12 @@ def together(found: Innovations, posterior: Posterior, gate: Gate,
 def rivals(found: Innovations, posterior: Posterior, alone: tuple[Mask, Array, float],
            place: Indices) -> Array:
     """
-    Return what the best rival of another place speaks against each factor, ln of odds, (m,).
+    Return the log odds against each factor by its best contradicting factor elsewhere, (m,).
 
-    Where the map knows less than the factors say, two may fit it and contradict each other: if b
-    is true, a is rather false than both are true.
+    Where the map is less certain than the factors, two may fit it and contradict each other: if b
+    is true, a is more likely false than both true.
 
-    alone, place : see `together`, but the log odds of all
+    alone, place : see `together`, with one log odds of all
     """
     fits, log_ratio, odds = alone
     unsure = np.flatnonzero(fits & (found.log_det > found.freedom * np.log(2)))
@@ -175,10 +166,9 @@ def rivals(found: Innovations, posterior: Posterior, alone: tuple[Mask, Array, f
 def _pairs(found: Innovations, posterior: Posterior, rows: Indices, log_ratio: Array,
            place: Indices) -> tuple[Indices, Indices, Array, Array]:
     """
-    Return the pairs of two places, both ways round, of those of some factors that fit best.
+    Return pairs of the best fitting of some factors, from two places, in both orders.
 
-    The one and the other, (pairs,) each, the square and the log ratio of both, see
-    `Innovations.joint`.
+    First and second, (pairs,) each, with their `Innovations.joint`.
     """
     best = rows[np.argsort(-log_ratio[rows], kind='stable')[:_CANDIDATES]]
     a, b = (best[side] for side in np.triu_indices(len(best), 1))
@@ -190,12 +180,11 @@ def _pairs(found: Innovations, posterior: Posterior, rows: Indices, log_ratio: A
 
 def noise_variance(found: Innovations) -> Array:
     """
-    Return by what the variances that odometry and loops state are to be multiplied, (2,).
+    Return the ratios of actual to stated variance of odometry and loops, (2,).
 
-    With `scale` of the odometry and `ratio scale` of the loops, true innovations have the
-    covariance `scale (spread + ratio I)`; the false ones any. Expectation and maximisation, from
-    several ratios and scales, of which the likeliest wins. Only the best predicted loops are
-    asked: their fit tells most.
+    With `scale` of the odometry and `ratio scale` of loops, innovations of inliers have the
+    covariance `scale (spread + ratio I)`. Expectation maximisation from several ratios and scales;
+    the likeliest wins. Only the best predicted loops, the most informative, are used.
     """
     best = np.argsort(found.log_det, kind='stable')[:_BEST_PREDICTED]
     k = found.system.block_size
@@ -206,10 +195,10 @@ def noise_variance(found: Innovations) -> Array:
     fits: list[tuple[float, float, float]] = []
     for ratio in _RATIOS:
         square, log_det = kernels.prediction.normalise(spread + ratio * np.eye(k), residual)
-        log_det -= (k - freedom) * np.log(ratio)  # what says nothing has no noise
+        log_det -= (k - freedom) * np.log(ratio)  # uninformative rows have no noise
         for start in (1.0, *(np.quantile(square, (0.1, 0.5)) / k).tolist()):
             likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, k, start)
-            # A factor of ten that files are off is as unlikely as a lie among what is believed.
+            # Prior: each factor of ten of misstatement is as unlikely as an accepted outlier.
             costs = _RATIO_COSTS * len(best) * (ratio != 1) - np.log(DOUBT) * (
                 abs(np.log10(scale)) + abs(np.log10(ratio)))
             fits.append((likelihood - costs, scale, ratio))
@@ -219,7 +208,7 @@ def noise_variance(found: Innovations) -> Array:
 
 def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indices, k: int,
                   start: float) -> tuple[float, float]:
-    """Return the log likelihood of the best scale of C near a start, and that scale."""
+    """Return the log likelihood of the best scale of C near a start, and the scale."""
     scale, before = max(start, TINY), np.inf
     start = scale
     while abs(scale / before - 1) >= SAME:
@@ -227,7 +216,7 @@ def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indi
                                          log_claim, freedom, k)
         odds = log_odds_of_false(log_ratio, 0)
         true = probability(log_ratio - odds)
-        # The one pseudo-factor at the start is for crowds without a true one.
+        # One pseudo-factor at the start, in case there is no inlier.
         before = scale
         scale = float((true @ square + start) / (true @ freedom + 1))
     likelihood = np.logaddexp(log_ratio - odds, 0.0).sum() - len(square) * np.logaddexp(0, -odds)

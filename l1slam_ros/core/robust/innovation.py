@@ -7,13 +7,13 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What a solved graph says of a factor, before or without it: how far off, and how sure.
+Innovations of factors against a solved graph, their covariances and likelihood ratios.
 
 In: a graph at its L2 optimum. Out: for any factor the covariance of its residual, and how likely
-it is to be true. Covariances come from samples of the posterior: solutions of `H y = A' xi` for
-white noise xi have the covariance H^-1. So the second moment of `J_i y_i + J_j y_j` is what the
-map's uncertainty adds to the residual of a factor outside the graph, and that of `xi - J y` is
-the covariance of the residual of one inside. All samples together cost a few ordinary solutions.
+it is an inlier. Covariances come from posterior samples: solutions of `H y = A' xi` for white
+noise xi have the covariance H^-1. So the second moment of `J_i y_i + J_j y_j` is the covariance
+that the map adds to the residual of a factor outside the graph; that of `xi - J y` is the
+covariance of the residual of one inside. All samples cost a few ordinary solutions.
 """
 
 from collections.abc import Callable
@@ -34,29 +34,33 @@ from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, linearise
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 _beta_quantile, _gamma_quantile = cache(beta_quantile), cache(gamma_quantile)
-# Noise has the tail of Student's distribution with so many degrees of freedom for each number of a
-# step: nobody knows its covariance any better. Half makes 5 of 89 runs worse, double 2.
+# Noise follows Student's distribution with this number of degrees of freedom for each component of
+# a step: its covariance is not known better. Half makes 5 of 89 runs worse, double 2.
 TAIL = 8
-# What noise alone makes in so few cases is not put down to it. So many true loops are refused at
-# most: of 89 runs half makes none worse, double 1.
+# Significance level; also the fraction of inliers that a gate may reject: half makes none of 89
+# runs worse, double 1.
 BY_CHANCE = 1e-3
-# The variances of odometry and loops are no further apart: beyond, the weights of the one are lost
-# in the rounding of the other, and no map can be factored.
+# Bound on the ratio of the variances of odometry and loops: beyond it the smaller weights are lost
+# in rounding, and the matrix cannot be factored.
 LEAST_RATIO = 1e-5
-# A factor whose residual has a variance below this part of its noise is hardly checked by others.
+# A factor is hardly checked by others if its residual has less than this part of its variance.
 CHECKED = 0.01
 
 
 @dataclass(frozen=True)
 class Posterior:
     """
-    A graph at its optimum.
+    A graph at its optimum, with posterior samples.
 
-    system : its linearisation, there or one step before, b what is left at the optimum of this;
-    noise : (m, k, q) signs, of each factor; samples : (free keyframes + 1, k, q) steps from it
-    that the noise makes, the last one of what is held fixed; moment : (m, k, k) what noise as
-    stated would make of the residual; speaks : (m, k) bool, see `BetweenFactors`; fixed :
-    keyframes that are held, see `anchor`.
+    Attributes
+    ----------
+    system : linearised there or one step before; b is minus the remaining residual
+    noise : (m, k, q) random signs
+    samples : (free keyframes + 1, k, q) steps that the noise causes, the last of fixed keyframes
+    moment : (m, k, k) of the residual under the stated noise
+    speaks : (m, k) bool, see `BetweenFactors`
+    fixed : number of keyframes held fixed, see `anchor`
+
     """
 
     system: LinearSystem
@@ -68,22 +72,21 @@ class Posterior:
 
     @property
     def residual(self) -> Array:
-        """Of each factor, whitened, (m, k)."""
+        """(m, k) whitened residuals."""
         return -self.system.b.reshape(len(self.system.blocks), -1)
 
     def left_over(self, rows: Indices) -> Array:
-        """Return what the noise makes of the residuals of some factors, (l, k, q)."""
+        """Return samples of the residuals of some factors, (l, k, q)."""
         system = self.system
         return self.noise[rows] - kernels.prediction.moved(
             system.keyframe[rows], system.blocks[rows], self.samples)
 
     def left_out(self) -> Array:
         """
-        Return the squared innovation of each factor by all others, (m,).
+        Return the leave-one-out squared innovation of each factor, (m,).
 
-        With the covariance R of the residual, `R^-1 r` is the residual of the factor if it were
-        left out and R^-1 its covariance, so the square is r'R^-1 r. Where the others hardly say
-        anything of it, that is 0.
+        With the covariance R of the residual r, `R^-1 r` is the innovation of the factor by all
+        others and R^-1 its covariance, so the square is r'R^-1 r; 0 where others hardly check it.
         """
         moment = filled(self.moment, ~self.speaks).copy()
         square: Array = kernels.prediction.normalise(moment, self.residual)[0]
@@ -96,16 +99,15 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     """
     Return the posterior of a graph about its optimum, poses (n, p).
 
-    solved : the system of the last step to these poses, which `cholesky` has factored, b what is
-    left there
+    solved : the system of the last step, factored by `cholesky`, with the remaining b
 
     Raises
     ------
-    GraphError : some keyframe is not tied to the anchor.
+    GraphError : a keyframe is not connected to the anchor.
 
     """
     system = solved or factorised(graph, poses, cholesky)
-    # A map that is to within its noise is no optimum to a factor that others hardly check.
+    # A map converged to within its noise is not optimal for factors hardly checked by others.
     step = cholesky.solve(system.transposed_times(system.b))
     system = replace(system, b=system.b - system.times(step))
     noise, samples = _steps(graph, system, cholesky)
@@ -118,8 +120,7 @@ def spread_of(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     """
     Return samples of the error of the L2 map (n, p) of a graph, (free keyframes, k, q).
 
-    variance : (m,), or (m, k) of its numbers, of the noise that there is, in units of what each
-    factor states
+    variance : (m,), or (m, k) by component, of actual noise in units of the stated
     """
     system = factorised(graph, poses, cholesky)
     roots = np.sqrt(np.atleast_2d(variance.T).T)[:, None, :, None]
@@ -128,12 +129,12 @@ def spread_of(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
 
 
 def covariances(samples: Array) -> Array:
-    """Return the covariance of each keyframe, (n, k, k), by samples (n, k, q)."""
+    """Return the covariance of each keyframe, (n, k, k), from samples (n, k, q)."""
     return samples @ samples.transpose(0, 2, 1) / samples.shape[2]
 
 
 def factorised(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> LinearSystem:
-    """Return the linear system of a graph about poses (n, p), which `cholesky` has factored."""
+    """Return the linear system of a graph about poses (n, p), factored by `cholesky`."""
     system = linearise(graph, poses)
     if not cholesky.factorise(system, np.ones_like(system.b)):
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
@@ -143,8 +144,8 @@ def factorised(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Lin
 
 def _steps(graph: FactorGraph, system: LinearSystem,
            cholesky: BlockCholesky) -> tuple[np.ndarray, Array]:
-    """Return signs (m, k, q), and the steps (free keyframes + 1, k, q) that such noise makes."""
-    # Signs have the covariance of white noise, and are quicker to draw.
+    """Return signs (m, k, q), and the steps (free keyframes + 1, k, q) that they cause."""
+    # Signs have the covariance of white noise and are quicker to draw.
     k = system.block_size
     q = kernels.prediction.SAMPLES
     noise = signs(keys(graph.between.i, graph.between.j), k, q)
@@ -159,10 +160,13 @@ def _steps(graph: FactorGraph, system: LinearSystem,
 def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,
                          freedom: Indices, k: int, tail: int = TAIL) -> Array:
     """
-    Return ln p(residual) + ln(volume of a false one's), (m,); freedom : (m,) of the residuals.
+    Return ln p(residual | inlier) - ln p(residual | outlier), (m,).
 
-    p is Student's, with `tail` degrees of freedom for each of the k numbers of a step: what a
-    covariance from as many samples says of one more (Jeffreys' prior).
+    Outliers are uniform over a volume, exp(log_claim). Inliers have Student's distribution with
+    `tail` degrees of freedom for each of the k components of a step: the prediction from as many
+    samples (Jeffreys' prior).
+
+    freedom : (m,) of the residuals
     """
     q = tail * k
     constant = by_freedom(lambda size: lgamma((q + 1) / 2) - lgamma((q + 1 - size) / 2)
@@ -172,7 +176,7 @@ def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,
 
 
 def by_freedom(value: Callable[[int], float], freedom: Indices) -> Array:
-    """Return a value for each of (m,) degrees of freedom, each worked out once."""
+    """Return a value for each of (m,) degrees of freedom, each computed once."""
     count = np.bincount(np.ravel(freedom))
     values: Array = np.array([value(k) if some else 0.0 for k, some in enumerate(count.tolist())])
     return values[freedom]
@@ -181,12 +185,17 @@ def by_freedom(value: Callable[[int], float], freedom: Indices) -> Array:
 @dataclass(frozen=True)
 class Innovations:
     """
-    Factors against a posterior that does not know them.
+    Innovations of factors outside the graph.
 
-    system : their linearisation, b minus the residual; spread : (m, k, k) covariance that the map
-    adds to the residual; square : (m,) the squared residual in units of its covariance
-    C = I + spread; log_det : (m,) of C; log_claim : (m,) of the volume of residuals that a false
-    factor could have; freedom : (m,) of the residual.
+    Attributes
+    ----------
+    system : linearised, b minus the residual
+    spread : (m, k, k) covariance that the map adds
+    square : (m,) NIS r'C^-1 r, C = I + spread
+    log_det : (m,) of C
+    log_claim : (m,) ln of the volume of residuals of outliers
+    freedom : (m,) of the residual
+
     """
 
     system: LinearSystem
@@ -197,16 +206,12 @@ class Innovations:
     freedom: Indices
 
     def log_ratio(self) -> Array:
-        """Return how much likelier each residual is if its factor is true, (m,) logarithms."""
+        """Return the `log_likelihood_ratio` of each factor, (m,)."""
         return log_likelihood_ratio(self.square, self.log_det, self.log_claim, self.freedom,
                                     self.system.block_size)
 
     def joint(self, posterior: Posterior, first: Indices, second: Indices) -> tuple[Array, Array]:
-        """
-        Return the squared residual of pairs of factors together, and their `log_ratio`, (pairs,).
-
-        first, second : (pairs,) factors
-        """
+        """Return the joint NIS and log ratio of pairs of factors, first and second, (pairs,)."""
         system = self.system
         k = self.system.block_size
         used = np.zeros(len(self.square), bool)
@@ -215,7 +220,7 @@ class Innovations:
         place = np.cumsum(used) - 1
         moved = kernels.prediction.moved(system.keyframe[rows], system.blocks[rows],
                                          posterior.samples)
-        # Of all with all: each is of many pairs.
+        # All products at once: each factor is in many pairs.
         columns = moved.reshape(len(rows) * k, -1) / np.sqrt(kernels.prediction.SAMPLES)
         shared = columns @ columns.T
         at = np.arange(len(rows))
@@ -229,11 +234,7 @@ class Innovations:
 
 def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
                 log_volume: Array) -> Innovations:
-    """
-    Return the innovations of the factors of a graph, none of which made the posterior.
-
-    log_volume : (k,) of `claimed_volume`
-    """
+    """Return the innovations of a graph's factors, none in the posterior; see `claimed_volume`."""
     system = linearise(graph, poses, fixed=posterior.fixed)
     factors = graph.between
     k = system.block_size
@@ -248,10 +249,10 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
 
 def _sagittas(graph: FactorGraph, posterior: Posterior) -> Array:
     """
-    Return what linearising leaves out of the covariance of absolute factors, (m, k, k).
+    Return the covariance that linearisation neglects for absolute factors, (m, k, k).
 
-    A long way with a heading not known well ends on an arc. Its sagitta, half the offset times
-    the turn, is taken for noise: between keyframes it is small, since both are carried along.
+    A long path with an uncertain heading ends on an arc. Its sagitta, half the offset times the
+    turn, counts as noise; between keyframes it is small: both move along.
     """
     manifold, factors = graph.manifold, graph.between
     steps = posterior.samples[factors.j - posterior.fixed]
@@ -264,7 +265,7 @@ def _sagittas(graph: FactorGraph, posterior: Posterior) -> Array:
 
 
 def log_claims(factors: BetweenFactors, log_volume: Array) -> Array:
-    """Return the logarithms of the volumes, in sigmas, that false factors fill, (m,)."""
+    """Return ln of the volume of whitened residuals of outliers, (m,)."""
     roots = np.diagonal(factors.sqrt_information, axis1=1, axis2=2)
     return (factors.speaks * log_volume).sum(axis=1) + np.log(
         np.where(factors.speaks, roots, 1.0)).sum(axis=1)
@@ -272,10 +273,9 @@ def log_claims(factors: BetweenFactors, log_volume: Array) -> Array:
 
 def stated_variance(factors: BetweenFactors) -> Array:
     """
-    Return the variance that odometry and loops state, (2,), each in the median of its kind.
+    Return the median stated variance of odometry and of loops, (2,).
 
-    Of a factor with a covariance S of k numbers it is det(S)^(1/k). A kind that has none is as the
-    other one.
+    For a covariance S of k components it is det(S)^(1/k). An absent kind gets the other's.
     """
     diagonal = np.abs(np.diagonal(factors.sqrt_information, axis1=1, axis2=2))
     log_root = np.where(factors.speaks, np.log(np.where(factors.speaks, diagonal, 1.0)), 0.0)
@@ -289,9 +289,9 @@ def stated_variance(factors: BetweenFactors) -> Array:
 
 def within_ratio(variance: Array, stated: Array) -> Array:
     """
-    Return the variances of odometry and loops, (2,), the less one raised to `LEAST_RATIO`.
+    Return variances of odometry and loops, (2,), the smaller raised to `LEAST_RATIO`.
 
-    variance, stated : (2,) in units of what they state, and what that is
+    variance : (2,) in units of stated : (2,)
     """
     effective = variance * stated
     if not np.isfinite(effective).all():
@@ -302,10 +302,10 @@ def within_ratio(variance: Array, stated: Array) -> Array:
 
 def claimed_volume(manifold: Manifold, poses: Array) -> Array:
     """
-    Return the logarithm of the volume that the claims of false factors fill, (k,) its factors.
+    Return ln of the volume that outliers fill, a term for each of k axes.
 
-    That of a Gaussian, (2 pi)^(k/2) sqrt(det M), as wide in each direction as the positions of
-    random pairs lie apart (a false factor need not know of the corridor), with any rotation.
+    That of a Gaussian, (2 pi)^(k/2) sqrt(det M), in each direction as wide as random pairs of
+    positions are apart (an outlier need not follow the corridor), with any rotation.
     """
     others = _others(len(poses))
     positions = manifold.positions(poses)
@@ -317,20 +317,20 @@ def claimed_volume(manifold: Manifold, poses: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _others(n: int) -> Indices:
-    """Return for each of n keyframes another one, at random, (n,): each round asks for these."""
+    """Return a random permutation of n keyframes, (n,), kept between rounds."""
     return np.random.default_rng(0).permutation(n)
 
 
 def chi2_quantile(probability: float, freedom: Indices) -> Array:
-    """Return what sums of so many squared standard normal numbers, (m,), stay below, (m,)."""
+    """Return the quantile of chi2 for each number of degrees of freedom, (m,)."""
     return by_freedom(lambda k: 2 * _gamma_quantile(k / 2, probability), freedom)
 
 
 def student_quantile(probability: float, freedom: Indices, k: int) -> Array:
     """
-    Return what r'C^-1 r of n numbers stays below, (m,), by how many they are: freedom (m,).
+    Return the gate of r'C^-1 r of n components, (m,), by freedom (m,).
 
-    As if C were the covariance of q samples, `TAIL` for each of the k numbers of a step, it has
+    With C from q samples, `TAIL` for each of the k components of a step, the square has
     Hotelling's distribution: T^2 (q - n + 1) / (q n) is Fisher's F of n and q - n + 1 degrees of
     freedom.
     """

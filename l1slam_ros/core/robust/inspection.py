@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What may be wrong with a graph, before anybody solves it.
+Check a graph before it is solved: long steps, misstated noise, offset loops.
 
-In: a graph. Out: which keyframes and factors are suspicious, and by how much; sentences are made
-of them elsewhere. All but `noise_scales` look at each factor once.
+In: a graph. Out: suspicious keyframes and factors, with numbers; sentences are made elsewhere. All
+but `noise_scales` visit each factor once.
 """
 
 from collections.abc import Callable
@@ -36,23 +36,23 @@ from l1slam_ros.core.graph.spanning_tree import pair_key, tree_poses
 from l1slam_ros.core.robust.innovation import BY_CHANCE, CHECKED
 from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 
-# A step this many times as long as nine in ten of all steps is no step of the same robot.
+# Steps this many times the 90% quantile are not of the same robot.
 _LONG = 10.0
-# Noise is judged in a part of the graph: a dense graph of 50,000 poses takes minutes to solve.
+# Noise is estimated in a part of this size: a dense graph of 50,000 poses takes minutes.
 _PART = 2000
-# Fewer spare measurements than this tell nothing of their noise, nor fewer steps of how a robot
-# moves; and against as many counts what was known of a noise before.
+# Fewest redundant measurements to estimate noise, and steps to estimate a robot's motion; also the
+# weight of prior noise, in measurements.
 FEWEST = 20
-# Poses need not be exact for their residuals to have the right size, nor ratios: steps at most,
-# and the part of chi2, or of a ratio, that no longer matters.
+# Approximate poses suffice for the size of residuals: limits of steps, and of the relative change
+# of chi2, or of a ratio.
 _STEPS = 20
 _TOLERANCE = 0.01
-# Errors that many times as large, or as small, as their information says are worth a sentence.
+# Ratio of actual to stated errors, either way, worth reporting.
 OFF_SCALE = 3.0
 
 
 def parallel_factors(graph: FactorGraph) -> Indices:
-    """Return the factors that share their pair of keyframes, either way round, (k,)."""
+    """Return the factors that share their pair of keyframes, in either direction, (k,)."""
     factors = graph.between
     _, inverse, counts = np.unique(pair_key(factors.i, factors.j, graph.n_poses),
                                    return_inverse=True, return_counts=True)
@@ -64,8 +64,7 @@ class LongSteps:
     """
     Odometry that jumps.
 
-    factors : (k,) of steps much longer than others; lengths : (k,) theirs [m]; ordinary : nine
-    in ten steps are shorter [m].
+    factors : (k,) of much longer steps; lengths : (k,) [m]; ordinary : 90% quantile of all [m]
     """
 
     factors: Indices
@@ -74,7 +73,7 @@ class LongSteps:
 
 
 def long_steps(graph: FactorGraph) -> LongSteps:
-    """Return the steps of odometry that are much longer than others."""
+    """Return the odometry steps much longer than others."""
     rows = np.flatnonzero(graph.between.is_odometry)
     length = step_lengths(graph)
     ordinary = float(np.quantile(length, 0.9)) if len(length) else 0.0
@@ -84,7 +83,7 @@ def long_steps(graph: FactorGraph) -> LongSteps:
 
 
 def step_lengths(graph: FactorGraph) -> Array:
-    """Return how long each step of odometry is [m], in the order of the factors."""
+    """Return the length of each odometry step [m], in their order."""
     manifold, factors = graph.manifold, graph.between
     steps = factors.measurement[factors.is_odometry]
     return manifold.motion(manifold.local(manifold.identity(len(steps)), steps))[0]
@@ -93,12 +92,15 @@ def step_lengths(graph: FactorGraph) -> Array:
 @dataclass(frozen=True)
 class NoiseScales:
     """
-    How many times as large as their information says the errors of factors are.
+    Ratios of actual to stated errors.
 
-    odometry, loops : ratios of standard deviations, NaN where too few factors are left to tell;
-    first, last : the keyframes between which this was found; turns : how many times that of
-    translations the ratio of rotations is; offset : (k,) the step that all loops lack, None where
-    noise explains it, see `lacked_step`.
+    Attributes
+    ----------
+    odometry, loops : of standard deviations, NaN with too few factors
+    first, last : keyframes between which they were estimated
+    turns : that of rotations over that of translations
+    offset : (k,) step that all loops lack, None if noise explains it
+
     """
 
     odometry: float
@@ -111,15 +113,15 @@ class NoiseScales:
 
 def noise_scales(graph: FactorGraph, rng: 'np.random.Generator') -> NoiseScales:
     """
-    Compare residuals at the L2 optimum with the information that came with them.
+    Compare residuals at the L2 optimum with the stated information.
 
-    For each of the two groups (odometry, loops) the squared residual is divided by what noise of
-    the stated size, drawn at random and solved for alike, leaves behind: so it counts how far
-    each group is fitted away. Weights follow the ratios found, a few times over.
+    The squared residual of each group (odometry, loops) is divided by that of random noise of the
+    stated size after the same fit, which accounts for the freedom it absorbs. Weights follow these
+    ratios, a few times over.
 
     Raises
     ------
-    GraphError : what was looked at cannot be solved.
+    GraphError : the part cannot be solved.
 
     """
     part, keyframes, is_loop = densest_part(graph)
@@ -153,18 +155,17 @@ def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
     """
     Return the step d [m, rad] that all loops lack, (k,): Z v2t(d) fits; None if noise explains it.
 
-    left_of : returns what a map, weighted by the variances, leaves of (rows, k + 1)
+    left_of : residuals of a map weighted by the variances, (rows, k + 1)
 
-    Z is the later keyframe seen from the earlier. With G (rows, k) the derivatives of what d adds,
-    the map and d minimise |A x - b - G d|^2, weighted by the variances (2,) of odometry and of
-    loops. G_p and r are what the map leaves of G and b: S = G_p'W G_p is the information of d,
-    d = -S^-1 G_p'W r, chi2 = d'S d. Directions in which the map follows are hardly checked, and
-    not asked for. The noise is that of loops after d; where it is off scale, false loops may make
-    an offset, so None.
+    Z is the later keyframe seen from the earlier. With G (rows, k) the derivatives by d, the map
+    and d minimise |A x - b - G d|^2, weighted by the variances (2,) of odometry and of loops. G_p
+    and r are G and b after the map is fitted: S = G_p'W G_p is the information of d, d = -S^-1
+    G_p'W r, chi2 = d'S d. Directions that the map follows are hardly checked, and excluded. The
+    noise is that of loops after d; off scale, outliers may cause an offset, so None.
     """
     manifold, factors = graph.manifold, graph.between
     k = manifold.TANGENT_SIZE
-    # What is listed from the later end lacks v2t(d)^-1 on the left.
+    # A loop listed from its later end lacks v2t(d)^-1 on the left.
     backward = -manifold.adjoint(manifold.inverse(factors.measurement))
     lacked = np.where((factors.i > factors.j)[:, None, None], backward, np.eye(k))
     G = (is_loop[:, None, None] * factors.sqrt_information @ lacked).reshape(-1, k)
@@ -184,7 +185,7 @@ def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
     after = before[:, 0] + before[:, 1:] @ d
     # Multiplied out: exact measurements leave nothing to divide by.
     found, noise = before[:, 0] @ before[:, 0], after @ after
-    spare = is_loop.sum() * k - len(share)  # the ratio of likelihoods, as the noise is found, too
+    spare = is_loop.sum() * k - len(share)  # ratio of likelihoods, the noise estimated, too
     likely = spare * np.expm1(2 * gamma_quantile(len(share) / 2, 1 - BY_CHANCE) / spare)
     is_sure = d @ S @ d * found > likely * noise
     is_large = d @ M @ d * found > is_loop.sum() * noise
@@ -193,21 +194,20 @@ def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
 
 
 def _turns(manifold: Manifold, left: Array) -> float:
-    """Return `NoiseScales.turns` of what is left (rows, 2) of residuals and of drawn noise."""
     square = (left**2).reshape(-1, manifold.TANGENT_SIZE, 2).sum(axis=0)
     found, drawn = (square[part].sum(axis=0) for part in (manifold.ROTATION, manifold.TRANSLATION))
     return float(np.sqrt(found[0] / found[1] * drawn[1] / drawn[0])) if square.all() else np.nan
 
 
 def cost_at(graph: FactorGraph, poses: Array) -> float:
-    """Return the L1 cost of a graph at poses (n, p), nothing compiled."""
+    """Return the L1 cost of a graph at poses (n, p), without compiled code."""
     manifold, factors = graph.manifold, graph.between
     B = manifold.between(*ends(graph, poses))
     return l1_cost(whiten(factors.sqrt_information, manifold.local(factors.measurement, B)))
 
 
 def _l2_poses(graph: FactorGraph) -> Array:
-    """Return the L2 map of a graph without absolute factors, (n, p): rotations first."""
+    """Return the L2 map of a graph without absolute factors, (n, p), rotations first."""
     manifold, poses = graph.manifold, tree_poses(graph, 0)
     for part in (manifold.ROTATION, manifold.TRANSLATION):
         system = _system(graph, poses).part(part)
@@ -225,10 +225,10 @@ def _l2_poses(graph: FactorGraph) -> Array:
 
 def _system(graph: FactorGraph, poses: Array) -> LinearSystem:
     """
-    Return the linear system of a graph by its manifold's verbs, nothing compiled.
+    Return the linear system of a graph, without compiled code.
 
-    A look at a graph is over before compiled loops are there. With B = Xi^-1 Xj the residual is
-    that of B seen from Z; a step s of i moves B on the right by -Ad(B^-1) s.
+    Inspection ends before that is loaded. With B = Xi^-1 Xj the residual is that of B seen from Z;
+    a step s of i moves B on the right by -Ad(B^-1) s.
     """
     manifold, factors = graph.manifold, graph.between
     B = manifold.between(*ends(graph, poses))
@@ -243,7 +243,7 @@ def _system(graph: FactorGraph, poses: Array) -> LinearSystem:
 
 def _least_squares(system: LinearSystem, b: Array, weights: Array | float = 1.0) -> Array:
     """
-    Return argmin_x sum_i w_i (A x - b)_i^2, (columns,) or (columns, k) for as many b.
+    Return argmin_x sum_i w_i (A x - b)_i^2, (columns,) or (columns, k) for k of b.
 
     Raises
     ------
@@ -267,10 +267,9 @@ def _least_squares(system: LinearSystem, b: Array, weights: Array | float = 1.0)
 
 def densest_part(graph: FactorGraph) -> tuple[FactorGraph, Indices, np.ndarray]:
     """
-    Return a connected part of some consecutive keyframes, with as many factors as may be.
+    Return the connected part of some consecutive keyframes with the most factors.
 
-    Its graph without absolute factors, its keyframes in the whole graph (k,), and which of its
-    factors are loops (m,).
+    A graph without absolute factors, its keyframes (k,), and which factors are loops (m,).
     """
     factors, n = graph.between, graph.n_poses
     first, last = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
@@ -285,9 +284,8 @@ def densest_part(graph: FactorGraph) -> tuple[FactorGraph, Indices, np.ndarray]:
 
 
 def _restricted(graph: FactorGraph, keyframes: Indices) -> tuple[FactorGraph, Indices]:
-    """Return the graph of these keyframes alone, ascending, and which factors it has."""
     factors = graph.between
-    index = np.full(graph.n_poses + 1, -1)  # the last one is the world's
+    index = np.full(graph.n_poses + 1, -1)  # the last entry is the world
     index[keyframes] = np.arange(len(keyframes))
     i, j = index[factors.i], index[factors.j]
     rows = np.flatnonzero((i >= 0) & (j >= 0))

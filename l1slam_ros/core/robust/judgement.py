@@ -7,11 +7,11 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What was found of the factors of a graph, and why its map is not to be relied on.
+Judgement of a graph's factors, and the reasons to doubt its map.
 
-In: the end of a robust solve, of all at once or while the map grows. Out: the judgement, with the
-reasons to doubt it, each with the keyframes where a person may look. What a person can do: vouch
-for a loop, strike one out, or state the noise as it is.
+In: the end of a robust solve, in batch or while driving. Out: accepted factors, their noise, and
+doubts with keyframes to inspect. A person can vouch for a loop, strike one out, or correct the
+stated noise.
 """
 
 from dataclasses import dataclass, field, replace
@@ -28,28 +28,33 @@ from l1slam_ros.core.robust.pairwise_consistency import RUN
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds.growth import Growth
 
-# Kinds of doubts, each with what it means.
+# Kinds of doubts and their meaning.
 WEAK = 'a weak map'  # no loop is accepted
-UNCONFIRMED = 'unconfirmed loops'  # accepted ones that all else hardly confirms
-OTHER_MAP = 'another map'  # that refused loops may be right about
+UNCONFIRMED = 'unconfirmed loops'  # accepted, but hardly confirmed by the others
+OTHER_MAP = 'another map'  # rejected loops may be right
 SLIP = 'a slip suspected'  # an odometry factor may have slipped, or not
-DRIFTS = 'a drift suspected'  # the odometry may drift otherwise
-UNFINISHED = 'not at an end'  # there were more rounds to come
-NORM = 'another norm'  # the same factors have another map in another norm
+DRIFTS = 'a drift suspected'  # the odometry may have another drift
+UNFINISHED = 'not at an end'  # the limit of rounds was reached
+NORM = 'another norm'  # the same factors have another map in L2
 NO_WHEELS = 'no wheels'  # scans alone show the motion
-FAILED = 'judging failed'  # the map is of what was accepted by then
-UNSOLVED = 'solving failed'  # so did solving for what is accepted
-PARTS = 'parts'  # nothing accepted joins them
+FAILED = 'judging failed'  # the map has the loops accepted before
+UNSOLVED = 'solving failed'  # solving for accepted factors failed
+PARTS = 'parts'  # no accepted factor joins them
 
 
 @dataclass(frozen=True)
 class Doubt:
     """
-    One reason why a map is not to be relied on.
+    A reason to doubt a map.
 
-    kind : one of the above; loops : how many it is about; first, last : the keyframes between
-    which they lie; detail : what failed, where something did; pairs : the keyframes of each of
-    the loops, either way round.
+    Attributes
+    ----------
+    kind : one of the above
+    loops : number concerned
+    first, last : keyframes that enclose them
+    detail : the error, or a number
+    pairs : keyframes of each loop, in either order
+
     """
 
     kind: str
@@ -63,20 +68,27 @@ class Doubt:
 @dataclass(frozen=True)
 class Judgement:
     """
-    What is believed of the first m between factors of a graph.
+    Judgement of the first m between factors of a graph.
 
-    accepted, suspect : (m,) bool, suspect is a loop that fits but could as well be chance, a loop
-    that is neither is rejected; sigmas : (m,) how far off each factor is, in units of its noise,
-    as stated or larger if it was found so, less than stated where that is far too much, see
-    `as_measured`: the length of the residual, and where it is not accepted, of that over the
-    uncertainty of the map, NaN before a loop was looked at; variance : (2,) of odometry and of
-    loops as it was found, in units of what they state; noise : (m,) that of each in a map, in the
-    same units; slips : (k,) the odometry factors that slipped, not accepted; doubts : reasons not
-    to rely on the map; settled : no more is to be found out from the factors that are there; drift
-    : by how much more each metre of the odometry turns than it says [rad/m]; confidence : see
-    `confidence`, NaN of a graph without loops; expected_error : of the map by its posterior [m];
-    is_refusal_doubted : refused loops may be true; meant : (2, k) the variance of each
-    number of odometry and of loops, where nobody stated it, in units of what is stated.
+    Attributes
+    ----------
+    accepted : (m,) bool
+    suspect : (m,) bool, loops that fit but may do so by chance; others not accepted are rejected
+    sigmas : (m,) length of the whitened residual, if not accepted root of the NIS, NaN before a
+        test; by the larger of stated and estimated noise, by less where the stated is far too
+        large, see `as_measured`
+    variance : (2,) estimated for odometry and loops, in units of the stated
+    noise : (m,) variance of each in a map, in these units
+    slips : (k,) odometry factors that slipped, not accepted
+    doubts : reasons to doubt the map
+    settled : present factors can show no more
+    drift : rotation of each metre of odometry beyond the measured [rad/m]
+    confidence : see `confidence`, NaN without loops
+    expected_error : of the map by its posterior [m]
+    is_refusal_doubted : rejected loops may be true
+    meant : (2, k) variance of components of odometry and loops where the stated is a placeholder,
+        in its units
+
     """
 
     accepted: Mask
@@ -95,30 +107,30 @@ class Judgement:
 
     @property
     def doubt(self) -> Doubt | None:
-        """The first reason not to rely on the map; None where all is well."""
+        """The first doubt; None without any."""
         return self.doubts[0] if self.doubts else None
 
     @staticmethod
     def nothing() -> 'Judgement':
-        """Return the judgement before there are factors."""
+        """Return the judgement of a graph without factors."""
         none = np.zeros(0, bool)
         return Judgement(none, none, np.zeros(0), np.ones(2), np.zeros(0),
                          np.zeros(0, np.int64))
 
     @property
     def is_noise_stated(self) -> bool:
-        """Whether factors are as noisy as they say."""
+        """Whether factors have their stated noise."""
         return bool((self.noise == 1).all())
 
     def broken_off(self, graph: FactorGraph, error: Exception) -> 'Judgement':
-        """Return what is believed where judging the loops of a graph came no further."""
+        """Return this judgement, doubted for a failure."""
         factors = graph.between
         left_out = ~factors.is_odometry & ~factors.struck & ~self.accepted
         doubt = doubt_of(graph, left_out, FAILED, str(error))
         return replace(self, doubts=(doubt,), settled=True, confidence=float('nan'))
 
     def renumbered(self, number: Indices) -> 'Judgement':
-        """Return the judgement where keyframes have other numbers, (n,), in what is doubted."""
+        """Return the judgement with new numbers (n,) of keyframes in its doubts."""
         if (np.diff(number) == 1).all():
             return self
         doubts = []
@@ -131,9 +143,9 @@ class Judgement:
 
     def of_all(self, graph: FactorGraph) -> 'Judgement':
         """
-        Return the judgement of all factors of a graph, from this one of those that are not struck.
+        Return the judgement of every factor, from that of those not struck.
 
-        Of the others it says nothing. What it judged beside those of the graph, ties, is left out.
+        Struck ones get neutral values; judged ones beyond the graph's, ties, go.
         """
         rows = graph.not_struck
         k = len(rows)
@@ -148,7 +160,7 @@ class Judgement:
                        noise=spread(self.noise, 1.0), slips=rows[self.slips[self.slips < k]])
 
     def with_parts(self, graph: FactorGraph) -> 'Judgement':
-        """Return the judgement of all factors of a graph, doubted if none joins some parts."""
+        """Return the judgement, with a doubt if accepted factors leave parts."""
         part = part_labels(graph.subset(self.accepted))
         firsts = np.unique(part, return_index=True)[1]
         if len(firsts) < 2:
@@ -161,37 +173,37 @@ class Judgement:
         return replace(self, doubts=(*self.doubts, doubt))
 
     def of_factors(self, which: Indices) -> 'Judgement':
-        """Return the judgement of some of the factors, (k,), or of some several times."""
+        """Return the judgement of some factors, (k,), which may repeat."""
         slipped = np.isin(np.arange(len(self.accepted)), self.slips)
         return replace(self, accepted=self.accepted[which], suspect=self.suspect[which],
                        sigmas=self.sigmas[which], noise=self.noise[which],
                        slips=np.flatnonzero(slipped[which]))
 
     def believed(self, graph: FactorGraph) -> FactorGraph:
-        """Return the accepted factors of a graph, as noisy as they are."""
+        """Return the accepted factors of a graph, with their noise."""
         return self.corrected(graph).subset(self.accepted, self.noise[self.accepted])
 
     def corrected(self, graph: FactorGraph) -> FactorGraph:
-        """Return a graph with the noise that was meant, and odometry without its drift."""
+        """Return a graph with the variance `meant`, and without drift."""
         return straightened(weighed(graph, self.meant), self.drift)
 
     def found_variance(self, graph: FactorGraph) -> Array:
-        """Return the variance that was found of these, in units of what they then state, (k,)."""
+        """Return the estimated variance of accepted factors, (k,), in units of `believed`."""
         loops = ~graph.between.is_odometry[self.accepted]
-        # Where the part is as noisy as was found, odometry is its unit.
+        # With estimated noise in the map, odometry is the unit.
         return self.variance_meant[(loops & self.is_noise_stated).astype(np.int64)]
 
     @property
     def variance_meant(self) -> Array:
-        """The variance of odometry and of loops as found, (2,), in units of what was meant."""
+        """Estimated variance of odometry and loops, (2,), in units of `meant`."""
         return self.variance / np.exp(np.log(self.meant).mean(axis=1))
 
     def extended(self, graph: FactorGraph, robust: bool) -> 'Judgement':
         """
-        Return the judgement of all factors that the graph has by now.
+        Return the judgement of every present factor.
 
-        Of the new ones, odometry is believed; a loop is suspect until it was looked at, or where
-        no loop is to be doubted, believed too. Whatever a person said by now counts.
+        New odometry is accepted; new loops are suspect until tested, accepted if not robust.
+        Trusted and struck ones are updated.
         """
         factors = graph.between
         known = len(self.accepted)
@@ -219,12 +231,12 @@ def doubt_of(graph: FactorGraph, rows: Indices | Mask, kind: str, detail: str = 
 
 
 def listed(pairs: Indices) -> tuple[tuple[int, int], ...]:
-    """Return pairs of keyframes (k, 2) as a doubt has them."""
+    """Return pairs of keyframes (k, 2) in the form of a doubt."""
     return tuple((i, j) for i, j in pairs.tolist())
 
 
 def weighed(graph: FactorGraph, variance: Array) -> FactorGraph:
-    """Return a graph with so many times the variance: (2, k), of odometry and of loops."""
+    """Return a graph with its variance scaled by (2, k), of odometry and of loops."""
     if (variance == 1).all():
         return graph
     is_loop = ~graph.between.is_odometry
@@ -232,7 +244,7 @@ def weighed(graph: FactorGraph, variance: Array) -> FactorGraph:
 
 
 def so_far(growth: Growth, drift: float = 0.0) -> Judgement:
-    """Return what a state believes, to fall back on; the loops that it left out are suspect."""
+    """Return the judgement of a state before tests; loops not accepted are suspect."""
     given = growth.given
     size = given.size
     slip = growth.cut & ~given.gap
@@ -243,7 +255,7 @@ def so_far(growth: Growth, drift: float = 0.0) -> Judgement:
 
 
 def judgement_of(growth: Growth) -> Judgement:
-    """Return what a state says of the factors that were given."""
+    """Return a state's judgement of the given factors, without doubts."""
     believed = so_far(growth)
     square, suspect = fits(growth)
     given = growth.given
@@ -257,11 +269,10 @@ def judgement_of(growth: Growth) -> Judgement:
 
 def _noise(growth: Growth) -> Array:
     """
-    Return the variance of each factor in a map, (m,), in units of what it states.
+    Return the variance of each factor in a map, (m,), in units of the stated.
 
-    Ones, unless these are wrong beyond doubt: where loops are noisier than they say and those
-    of a place err together, these are worth one, and all are as noisy as was found; odometry
-    is the unit.
+    Ones, unless clearly wrong: where loops are noisier than stated and those of a place share an
+    error, these count as one, and all have their estimated noise, in units of odometry.
     """
     given = growth.given
     noise = np.ones(len(given.factors))
@@ -279,17 +290,16 @@ def _noise(growth: Growth) -> Array:
 
 def fits(growth: Growth) -> tuple[Array, Mask]:
     """
-    Return how well each factor fits: a square (m,) of sigmas, and the loops that are suspect.
+    Return how well each factor fits, a square (m,) of sigmas, and suspect loops, (m,) bool.
 
-    The square is that of the residual, and of what is not accepted, of the innovation. Suspect,
-    (m,) bool, is a loop that fits and yet was not accepted.
+    The squared residual, for factors not accepted the NIS. Suspect loops pass the gate but were
+    not accepted.
     """
     given = growth.given
     accepted = growth.accepted & ~growth.cut
     square = np.zeros(len(given.factors))
     square[growth.accepted] = (growth.posterior.residual**2).sum(axis=1)
-    # While nothing ties the map to the world, nothing is known of what names it; nor, while
-    # nothing joins two parts, of what leads from one to the other.
+    # Absolute factors are not predicted before any is accepted, nor are factors between parts.
     square[~accepted] = np.nan
     outside = np.flatnonzero(~accepted & growth.may_be_predicted & ~growth.across())
     square[outside] = growth.uncut().innovations(outside).square

@@ -7,12 +7,11 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Loops that agree with each other, whatever the map says of them (pairwise consistency, PCM).
+Pairwise consistency of loops, independent of the map's prediction of them (PCM).
 
-In: loops of a robust solve. Out: those that agree with one of them, in the surest way: from that
-one, and from how its ends lie to those of the others, the others follow. Where nothing accepted
-spans a slip of the odometry, or a gap, both sides are right in themselves: every true loop across
-is far off, but all of them agree.
+In: loops of a robust solve. Out: those that agree best with one, which predicts them through the
+relative poses of their first ends and of their second ends. Where no accepted loop spans a slip or
+a gap, both sides are right in themselves: inliers across fail the gate, but all agree.
 """
 
 import numpy as np
@@ -31,11 +30,11 @@ from l1slam_ros.core.robust.rounds.growth import Growth, gain_of_places
 
 # First ends, second ends and measurements of loops.
 Ends = tuple[Indices, Indices, Array]
-# So many loops are asked.
+# Loops compared at most.
 ASKED = 250
-# Of each one so many pairs are looked at closely, those that differ least.
+# Pairs evaluated for each loop, on average: those that differ least.
 _NEAREST = 20
-# A run has so many loops, and each agrees with half as many others of it.
+# Loops of a run, each of which agrees with half this number of others.
 RUN = 6
 
 NONE: Indices = np.zeros(0, np.int64)
@@ -43,10 +42,10 @@ NONE: Indices = np.zeros(0, np.int64)
 
 def strongest_group(growth: Growth, rows: Indices) -> Indices:
     """
-    Return of some loops those that agree best, none where that may be chance, (k,).
+    Return the loops that agree best with one, the first; none where that may be chance, (k,).
 
-    All agree with the first one. Each place counts once, by the best log ratio of its loops, less
-    ln m: each could have agreed by chance with any of the m that were asked.
+    Each place counts once, by the best log ratio of its loops, less ln m: any of the m compared
+    could agree by chance.
     """
     rows = asked(growth, rows)
     if len(rows) < 2:
@@ -56,7 +55,7 @@ def strongest_group(growth: Growth, rows: Indices) -> Indices:
     evidence = _evidence(place, one, other, log_ratio)
     best = int(np.argmax(evidence))
     needed = np.log(len(rows) / DOUBT)
-    one_each = rows[np.sort(first)]  # in the order of `asked`, whatever places are called
+    one_each = rows[np.sort(first)]  # in the order of `asked`, whatever their numbers
     if evidence[best] < needed or evidence[best] < needed + _by_chance(growth, one_each):
         return NONE
     group: Indices = rows[np.concatenate(([best], other[one == best]))]
@@ -65,9 +64,9 @@ def strongest_group(growth: Growth, rows: Indices) -> Indices:
 
 def strongest_across(growth: Growth) -> Indices:
     """
-    Return the loops that agree best how two parts lie to each other, or none, (k,).
+    Return the loops that agree best on the relative pose of two parts, or none, (k,).
 
-    They are of two places or more; where such are not, of one that is a long run.
+    They are of two places or more, else of one long run.
     """
     given, rows = growth.given, growth.joining()
     pair = pair_key(growth.part[given.low[rows]], growth.part[given.high[rows]],
@@ -82,10 +81,10 @@ def strongest_across(growth: Growth) -> Indices:
 
 def longest_run(growth: Growth, rows: Indices) -> Indices:
     """
-    Return of some loops the run that most of them are of, none where there is none, (k,).
+    Return the run that most of some loops belong to, or none, (k,).
 
-    To outweigh the odometry it is twice as long as others: of recorded ones that have ten loops
-    five in six are true.
+    To outweigh the odometry it is twice as long as others: of recorded ones with ten loops five in
+    six are true.
     """
     rows = asked(growth, rows)
     longest = max(runs(growth, rows), key=len, default=NONE)
@@ -94,10 +93,10 @@ def longest_run(growth: Growth, rows: Indices) -> Indices:
 
 def runs(growth: Growth, rows: Indices) -> list[Indices]:
     """
-    Return of some loops those of one place that are no one mistake.
+    Return those of some loops that are of one place, but hardly with one error.
 
-    A robot that goes the same way twice sees one place all along it. So many loops that agree in
-    pairs, along a way so long at either end, are hardly all false.
+    A path travelled twice is one place. Enough loops that agree in pairs, over a long path at
+    either end, are hardly all false.
     """
     rows = asked(growth, rows)
     one, other, _ = agreement(growth, rows)
@@ -111,7 +110,7 @@ def runs(growth: Growth, rows: Indices) -> list[Indices]:
         own = own[2 * count[own] >= RUN]
         ways = [np.ptp(poses[ends[rows[own]]], axis=0).max(initial=0.0)
                 for ends in (given.low, given.high)] if len(own) >= RUN else [0.0]
-        # What both ways together go is more than what is near.
+        # Both lengths together exceed the linking distance.
         if min(ways) > NEAR / 2:
             order = np.argsort(-count[own], kind='stable')
             found.append(rows[own[order]])
@@ -120,10 +119,10 @@ def runs(growth: Growth, rows: Indices) -> list[Indices]:
 
 def gain_of(growth: Growth, as_stated: Growth, cut: Growth) -> float:
     """
-    Return what places and runs say that a cut wins, and places that lose loops, ln of odds.
+    Return the log odds of a cut by places and runs won, less places that lose loops.
 
-    A robot that goes the same way again and again sees one place all along: that is won before,
-    however many of its loops are refused. So a run of these counts as a place does.
+    A path travelled repeatedly is one place, won before, however many of its loops were rejected:
+    a run of these counts as a place.
     """
     place, before = growth.given.place, growth.loops
     more = np.flatnonzero(
@@ -134,10 +133,9 @@ def gain_of(growth: Growth, as_stated: Growth, cut: Growth) -> float:
 
 def agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
     """
-    Return those of some loops that agree with others of their place, (k,), if hardly by chance.
+    Return those of some loops that agree with others of their place, if hardly by chance, (k,).
 
-    The evidence is that of the best loop of a place: of all that agree with it, as of places in
-    `strongest_group`.
+    The evidence is the best loop's, summed as over places in `strongest_group`.
     """
     _, number, count = np.unique(growth.given.place[rows], return_inverse=True, return_counts=True)
     rows = asked(growth, rows[count[number] > 1])
@@ -154,14 +152,14 @@ def agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
 
 
 def asked(growth: Growth, rows: Indices) -> Indices:
-    """Return `ASKED` of some loops, as if at random, or all, (k,)."""
+    """Return a pseudo-random selection of `ASKED` loops, or all, (k,)."""
     order = np.argsort(keys(growth.given.low[rows], growth.given.high[rows]))
     chosen: Indices = rows[order[:ASKED]]
     return chosen
 
 
 def _evidence(place: Indices, one: Indices, other: Indices, log_ratio: Array) -> Array:
-    """Return the evidence of all places for each loop, (k,), by the pairs that agree."""
+    """Return the evidence of all places for each loop, (k,), from pairs that agree."""
     by_place = np.zeros((len(place), place.max() + 1))
     np.maximum.at(by_place, (one, place[other]), log_ratio - np.log(len(place)))
     by_place[np.arange(len(place)), place] = 0.0
@@ -170,10 +168,10 @@ def _evidence(place: Indices, one: Indices, other: Indices, log_ratio: Array) ->
 
 def _by_chance(growth: Growth, rows: Indices) -> float:
     """
-    Return the evidence of loops of one place each whose second ends are exchanged at random.
+    Return the best evidence of loops of one place each with second ends permuted at random.
 
-    On a sphere, or in any way that is alike everywhere, loops agree by chance far more often than
-    if what they claim filled a volume.
+    On a sphere, or any path alike everywhere, loops agree by chance far more often than in a
+    volume.
     """
     exchanged = np.random.default_rng(0).permutation(growth.given.high[rows])
     pairs = agreement(growth, rows, exchanged)
@@ -183,7 +181,7 @@ def _by_chance(growth: Growth, rows: Indices) -> float:
 def spanned(low: Indices, high: Indices, n: int) -> Indices:
     """Return how many factors span the step from each of n keyframes to the next, (n - 1,)."""
     change = np.zeros(n, np.int64)
-    np.add.at(change, np.maximum(low, 0), 1)  # the world is before all keyframes
+    np.add.at(change, np.maximum(low, 0), 1)  # the world precedes all keyframes
     np.add.at(change, high, -1)
     return np.cumsum(change)[:-1]
 
@@ -193,13 +191,11 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     """
     Return the pairs of some loops that rather agree than not, three (pairs,).
 
-    Positions of the one and the other in `rows`, each pair both ways round, and the logarithm of
-    how much likelier their difference is if they agree than by chance.
+    Positions of both in `rows`, each pair in both orders, and ln of the likelihood ratio of their
+    difference, agreement against chance. One predicts the other by the map's relative poses of
+    their first ends and of their second ends, whatever their innovations.
 
-    From the one loop follows the other, if the map is right about how their first ends lie to
-    each other, and their second ends; whatever it says of the loops themselves.
-
-    high : (k,) second ends to ask of, None: their own
+    high : (k,) second ends; None: their own
     """
     given = growth.given
     manifold = given.graph.manifold
@@ -213,7 +209,7 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     if not len(a):
         return a, b, np.zeros(0)
     known = with_world(manifold, poses)
-    # Where each says that its second end is, and by what this would have to move there.
+    # Second ends as each loop predicts them, and the step there that reconciles them.
     said = manifold.compose(known[first], Z)
     back = manifold.compose(known[second], manifold.inverse(said))
     error = manifold.residual(said[b], back[a], known[second][b])
@@ -240,7 +236,7 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
 
 
 def _ends_by_part(growth: Growth, rows: Indices, high: Indices) -> Ends:
-    """Return loops as from an earlier part to a later one, within a part to the later keyframe."""
+    """Return loops directed to the later part, or within one to the later keyframe."""
     given = growth.given
     low = given.low[rows]
     Z = given.factors.measurement[rows]
@@ -251,9 +247,9 @@ def _ends_by_part(growth: Growth, rows: Indices, high: Indices) -> Ends:
 
 def _spread(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) -> Array:
     """
-    Return what the map's uncertainty makes of the whitened difference of pairs, (pairs, k, k).
+    Return the covariance of the whitened difference of pairs by the map, (pairs, k, k).
 
-    From a follows F Za S for b, with F from the first end of b to that of a, and S from the second
+    Loop a predicts F Za S for b, with F from the first end of b to that of a, S from the second
     end of a to that of b. To first order Ad (Za S)^-1 and -Ad (F Za S)^-1 times the steps of the
     first ends of a and b, -Ad S^-1 and the identity times those of the second ends.
     """

@@ -7,12 +7,12 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Places: loops that may be one mistake, or have one error.
+Places: groups of loops that may share one error.
 
-In: a graph. Out: the number of the place of each loop. Two loops that join the same two stretches
-of the way and claim nearly the same are linked; a place is what links tie together (single
-linkage). Near is measured along the way in metres, never in keyframes. And what neighbours say of
-each other, and whether the loops of a place err together.
+In: a graph. Out: the place of each loop. Loops are linked that join the same two stretches of the
+path and measure nearly the same offset from the odometry; a place is a connected component of
+links (single linkage). Distances are in metres along the path, not in keyframes. Also repeated
+loops, neighbours, and a test for a common error.
 """
 
 import numpy as np
@@ -24,25 +24,24 @@ from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.core.robust.innovation import BY_CHANCE
 
-# Linked are loops whose ends lie within so many metres along the way, in sum, or within the length
-# of so many ordinary steps, where keyframes are far apart; and what they claim, too.
+# Ends of linked loops are within this distance along the path, in sum, or within this many median
+# steps where keyframes are far apart; so are their offsets.
 NEAR = 5.0
 _NEAR_STEPS = 10
-# [m, rad] What two loops of one pair of keyframes measure is the same to so much in a file that
-# gives one loop twice, or from either end, rounded; and hardly ever where they were measured.
+# [m, rad] Loops between the same keyframes that differ by less are one, listed twice or from
+# either end, rounded; separate measurements hardly ever agree so closely.
 _SAME = 1e-4
-# Claims are told apart to this part of it, so that a robot that stands has few different ones.
+# Rounding, as a part of the linking distance: a robot at rest has few distinct loops.
 _GRAIN = 0.1
 
 
 def first_told(graph: FactorGraph, left: Indices) -> Indices:
     """
-    Return for each factor the first that says the same of the same keyframes, (m,), mostly itself.
+    Return the first factor with the same measurement of the same keyframes, (m,), mostly itself.
 
-    Front ends write a loop twice, or from either end. It was measured once, and is no witness of
-    itself.
+    Front ends list a loop twice, or from either end; it cannot confirm itself.
 
-    left : (k,) the factors that are compared, any other stands for itself
+    left : (k,) factors to compare; others map to themselves
     """
     first = np.arange(len(graph.between))
     low, high, Z = ends_in_time(graph)
@@ -58,16 +57,12 @@ def first_told(graph: FactorGraph, left: Indices) -> Indices:
 
 def err_together(place: Indices, residual: Array, drawn: Array) -> bool:
     """
-    Return whether loops of a place err together beyond doubt, and not each for itself.
+    Return whether the loops of a place share an error, at the level `BY_CHANCE`.
 
-    Then their sums over a place are larger, compared with single loops.
+    Then their sums over a place are larger, relative to single loops.
 
-    Parameters
-    ----------
-    place : (m,) of each loop
-    residual : (m, k) whitened
-    drawn : (m, k, q) what is left of it by noise that is drawn for each loop
-
+    place : (m,) of each loop; residual : (m, k) whitened; drawn : (m, k, q) samples of it with
+    independent noise
     """
     _, number, count = np.unique(place, return_inverse=True, return_counts=True)
     sums, left = (np.zeros((len(count), *values.shape[1:])) for values in (residual, drawn))
@@ -88,20 +83,20 @@ def err_together(place: Indices, residual: Array, drawn: Array) -> bool:
 
 def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     """
-    Return of each factor the number of its place, (m,), and where it joins the way, (m, 2).
+    Return the place of each factor, (m,), and its coordinates along the path, (m, 2).
 
-    The latter are the sum and the difference of its ends' distances along the way, in units of
-    what is near: so two factors are as far apart as the larger difference of the two numbers.
+    These are the sum and the difference of the path lengths of its ends, in units of the linking
+    distance: factors are as far apart as the larger difference of the two.
 
     chain : (n, p) poses along the odometry
     """
     manifold = graph.manifold
     low, high, Z = ends_in_time(graph)
     positions = manifold.positions(chain)
-    # A landmark is where the way is that it is seen from.
+    # A landmark is where the keyframe is that places it.
     on_way = np.where(graph.is_landmark[:, None], positions[graph.parent], positions)
     steps = np.linalg.norm(np.diff(on_way, axis=0), axis=1)
-    # The world is where the way begins, as WORLD finds it: last.
+    # The world is at the start of the path; `WORLD` indexes the last entry.
     way = np.concatenate(([0.0], np.cumsum(steps), [0.0]))
     near = max(NEAR, _NEAR_STEPS * float(np.median(steps)) if len(steps) else 0.0)
     ends = np.stack((way[high] + way[low], way[high] - way[low]), axis=1) / near
@@ -114,7 +109,7 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
 
 
 def mates(place: Indices, ends: Array) -> tuple[Indices, Indices]:
-    """Return the pairs of loops of a place within reach, both ways round, (pairs,) each."""
+    """Return the pairs of neighbouring loops of a place, both orders, (pairs,) each."""
     one, other = _near(ends, 1.0)
     same = place[one] == place[other]
     one, other = one[same], other[same]
@@ -123,9 +118,9 @@ def mates(place: Indices, ends: Array) -> tuple[Indices, Indices]:
 
 def _cells(corners: Array) -> tuple[Array, Indices]:
     """
-    Return the corners (n, k) without repetition, in order, and which of these each is, (n,).
+    Return the distinct rows of corners (n, k), sorted, and the index of each, (n,).
 
-    `np.unique` along an axis does the same in twice the time, all of which it holds Python's lock.
+    Twice as fast as `np.unique` along an axis, which holds Python's lock throughout.
     """
     order = np.lexsort(corners.T[::-1])
     ordered = corners[order]
@@ -137,10 +132,10 @@ def _cells(corners: Array) -> tuple[Array, Indices]:
 
 def _near(points: Array, reach: float) -> tuple[Indices, Indices]:
     """
-    Return the pairs of points (n, k) that no component tells further apart than `reach`, (pairs,).
+    Return the pairs of points (n, k) within `reach` in each component, (pairs,).
 
-    In strips as wide as that along the first component, each sorted by the second. SciPy's trees
-    do the same, but to import them takes longer than to solve most graphs.
+    By strips of that width along the first, each sorted by the second. SciPy's trees do the same,
+    but their import takes longer than most solves.
     """
     strip = np.floor(points[:, 0] / reach)
     height = np.ptp(points[:, 1]) + 4 * reach if len(points) else 0.0

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The evidence of a robust solve: what is given when it begins, and no round changes.
+The prepared graph of a robust solve, which no round changes.
 
-In: a graph. Out: its factors in the order of time, with a factor for each gap of the odometry;
-which of them are loops, and of which place each is.
+In: a graph. Out: its factors with the earlier keyframe first, and one for each gap of the
+odometry; which factors are loops, and their places.
 """
 
 from dataclasses import dataclass
@@ -25,11 +25,11 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.innovation import BY_CHANCE, stated_variance, student_quantile
 from l1slam_ros.core.robust.places import mates, places
 
-# A place may be one mistake, and two that agree hardly: they join parts, and what is as likely but
-# for two has a rival. The noise is learnt of loops of so many places at least, and a slip is
-# suspected: of fewer, errors may be one. A place that joins more than this part of the keyframes
-# is no one mistake. Of 89 runs parts joined by 4 places are worse in 3; noise of 6 places changed
-# 3, slips of 2 or 6 none, and none is worse; twice the part makes 1 worse.
+# A place may have one error, but two hardly agree by chance: two join parts, and a hypothesis less
+# likely by no more than two places is a rival. Noise is estimated, and slips suspected, from
+# FEWEST_PLACES at least. A place across more than this part of the keyframes has no single error.
+# Of 89 runs joining by 4 places makes 3 worse; noise from 6 changes 3, slips from 2 or 6 none,
+# none worse; twice the part makes 1 worse.
 TWO_PLACES, FEWEST_PLACES = 2, 3
 _SMALL = 0.5
 
@@ -37,12 +37,18 @@ _SMALL = 0.5
 @dataclass(frozen=True)
 class Evidence:
     """
-    What is given to a robust solve.
+    The prepared graph of a robust solve.
 
-    graph : the one given in the order of time, and an odometry factor for each gap; size : factors
-    given; chain : (n, p) poses along the odometry; is_loop : (m,) bool of the between factors;
-    gap : (m,) bool, odometry that says nothing; place : (m,), mates : see `places`, of loops;
-    stated : (2,) the variance that odometry and loops state.
+    Attributes
+    ----------
+    graph : earlier keyframes first, with an odometry factor for each gap
+    size : number of given factors
+    chain : (n, p) poses along the odometry
+    is_loop : (m,) bool of the between factors
+    gap : (m,) bool, odometry without information
+    place, mates : (m,), pairs of loops, see `places`
+    stated : (2,) stated variance of odometry and loops
+
     """
 
     graph: FactorGraph
@@ -61,7 +67,7 @@ class Evidence:
 
     @property
     def trusted(self) -> Mask:
-        """(m,) bool: the factors that a person vouches for."""
+        """(m,) bool: factors a person vouches for."""
         return self.factors.trusted
 
     @property
@@ -76,7 +82,7 @@ class Evidence:
 
     @property
     def is_step(self) -> Mask:
-        """(m,) bool: the odometry of robots, not the sightings that place landmarks."""
+        """(m,) bool: odometry, without sightings that place landmarks."""
         return np.asarray(~self.is_loop & ~self.graph.is_landmark[self.high])
 
     def spanning(self, step: int) -> Mask:
@@ -85,20 +91,20 @@ class Evidence:
         return span
 
     def gate(self, freedom: Indices, refused: float = BY_CHANCE) -> Array:
-        """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
+        """Return the bound on squared innovations of inliers, (m,), by freedom (m,)."""
         return student_quantile(1 - refused, freedom, self.graph.manifold.TANGENT_SIZE)
 
     @property
     def log_odds_of_place(self) -> float:
-        """What the loops of a place are worth, ln of odds: half a gate."""
+        """Log odds that a place contributes: half a gate."""
         return float(self.gate(np.array([self.graph.manifold.TANGENT_SIZE]))[0] / 2)
 
     def count_places(self, loops: Indices | Mask) -> int:
-        """Return of how many places some loops are."""
+        """Return the number of places of some loops."""
         return len(np.unique(self.place[loops]))
 
     def may_err_as_one(self, loops: Indices, fewest: int = FEWEST_PLACES) -> bool:
-        """Return whether loops are of fewer places, none of which joins much of the way."""
+        """Return whether loops are from fewer places, none of which spans much of the path."""
         place = self.place[loops]
         each = (loops[place == number] for number in np.unique(place))
         return self.count_places(loops) < fewest and all(
@@ -107,14 +113,14 @@ class Evidence:
 
 
 def evidence_of(graph: FactorGraph) -> Evidence:
-    """Return the evidence that a graph is."""
+    """Return the prepared graph."""
     size = len(graph.between)
     whole = bridged(graph)
-    # Which end is named first is no reason to judge otherwise.
+    # Results must not depend on the end that is named first.
     in_order = turned(whole, whole.between.i > whole.between.j)
     gap: Mask = vague_odometry(in_order) | (np.arange(len(whole.between)) >= size)
-    # A gap says where its sides are, see `Growth.subgraph`. As vague as that of a long part may be
-    # stated, digits are lost: the part would turn about it by its rounding.
+    # A gap keeps its sides in place, see `Growth.subgraph`. With as little information as may be
+    # stated, rounding would turn a long part about it.
     graph = as_sure(in_order, gap)
     chain = odometry_poses(graph)
     is_loop: Mask = ~graph.between.is_odometry

@@ -7,9 +7,9 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The rounds of a robust solve: predict, gate, accept, solve.
+The rounds of a robust solve: predict, gate, accept, solve; see `batch`.
 
-In: the evidence and what is accepted of it. Out: the same with more loops accepted. See `batch`.
+In: the prepared graph and its accepted factors. Out: the same with more loops accepted.
 """
 
 import copy
@@ -41,15 +41,15 @@ from l1slam_ros.core.robust.rounds.noise import Noise
 from l1slam_ros.core.solvers.block_cholesky import with_pattern
 from l1slam_ros.core.solvers.gauss_newton import ChangingOrder, l2_optimum
 
-# A loop that was dropped that often is not tried again; half and double make none of 89 worse.
+# A loop dropped this often is not tried again; half or double makes none of 89 runs worse.
 _CHANCES = 2
-# So often noise is learnt anew of other factors: each time half of what it was before may stay.
+# Iterations of noise estimation after factors changed: each may keep half of the last estimate.
 _LEARNT_ANEW = 8
-# Numbers of a step that have one variance, in units of what is stated: moves and turns; in space
-# those of the floor and of the height apart.
+# Components that share a variance, in stated units: translation and rotation; in space those of
+# the floor and of the height apart.
 _GROUPS = {3: (slice(0, 2), slice(2, 3)),
            6: (slice(0, 2), slice(2, 3), slice(3, 5), slice(5, 6))}
-# While driving so many of the last absolute factors are looked at, with their neighbours.
+# While driving, this many of the last absolute factors are considered, with neighbours.
 _LATEST = 50
 
 
@@ -57,13 +57,19 @@ class Growth:
     """
     The state of a robust solve, which each round changes.
 
-    given : the evidence; accepted : (m,) bool of its factors; cut : (m,) bool, odometry that says
-    nothing: the gaps, and where it slipped; part : (n,) number of the part of each keyframe;
-    poses : (n, p) the L2 map of the accepted; posterior : of these; noise : as it was found;
-    slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
-    ventured : (m,) bool, loops of runs that noisier odometry explained; drops : (m,) how often
-    each was accepted and did not fit; check : called before long steps, raises where the work
-    shall stop.
+    Attributes
+    ----------
+    given : the prepared graph
+    accepted : (m,) bool of its factors
+    cut : (m,) bool, odometry not used: gaps and slips
+    part : (n,) connected component of each keyframe
+    poses, posterior : (n, p) the L2 map, and its posterior
+    noise : as estimated
+    slip_odds : ln P(slipped) / P(measured) of suspected odometry factors
+    ventured : (m,) bool, loops of runs that noisier odometry explained
+    drops : (m,) how often each was accepted and did not fit
+    check : called before long steps, raises to stop
+
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -82,28 +88,28 @@ class Growth:
         self.drops = none.astype(np.int64)
 
     def begin(self) -> None:
-        """Solve for what is accepted, and learn from the loops how large the noise is."""
+        """Solve for the accepted factors, and estimate the noise from innovations of loops."""
         self._tie_to_world()
         self.solve()
         rows = self.undecided()
         graph = self.given.graph
         first = first_told(graph, parallel_factors(graph))
-        # Odometry that stands there twice fits itself, whatever the noise.
+        # A loop that repeats an odometry factor fits whatever the noise.
         rows = rows[~self.given.factors.is_absolute[rows] & (first[rows] == rows)]
-        # Else the noise that is learnt of them would fit their mistake.
+        # An estimate from them would absorb their common error.
         if not self.given.may_err_as_one(rows):
             self.noise = self.noise.found(
                 self.noise.variance * noise_variance(self.innovations(rows)))
             self.solve()
 
     def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
-        """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
+        """Continue from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
         self.poses, self.noise = poses, self.noise.found(variance)
         self.accepted[: self.given.size] = accepted | self.given.trusted[: self.given.size]
         self.cut |= ~self.accepted & ~self.given.is_loop
         self.accepted |= self.cut
         self._tie_to_world(_LATEST)
-        # What the noise of these is, is known.
+        # The noise was estimated from these factors.
         self.noise = replace(self.noise, learnt_of=self.accepted.copy())
         if self.loops.any():
             self.solve()
@@ -112,27 +118,27 @@ class Growth:
 
     @property
     def loops(self) -> Mask:
-        """(m,) bool: the loops that are accepted."""
+        """(m,) bool: the accepted loops."""
         return self.accepted & self.given.is_loop
 
     @property
     def may_be_predicted(self) -> Mask:
-        """(m,) bool: not absolute factors while none of these is accepted."""
+        """(m,) bool: all but absolute factors while none of these is accepted."""
         absolute = self.given.factors.is_absolute
         return ~absolute | (self.accepted & absolute).any()
 
     def _tie_to_world(self, latest: int | None = None) -> None:
         """
-        Accept the absolute factors that agree with their neighbours, if these are more than are.
+        Accept absolute factors that agree with neighbours, if they extend or outnumber the old.
 
-        Until some are, the map says nothing of any; and behind a long way, little of the next.
+        Until some are accepted the map predicts none, and after a long path the next one poorly.
 
-        latest : so many of them are looked at; None: all
+        latest : consider this many of the last; None: all
         """
         absolute = self.given.factors.is_absolute
         held = self.accepted & absolute
         if (held != absolute).any():
-            # As many may have been accepted for want of others.
+            # Up to this number may have been accepted for lack of others.
             count = np.count_nonzero(held)
             known = count > self.given.graph.manifold.TRANSLATION.stop
             rows, variance = first_fixes(
@@ -144,12 +150,12 @@ class Growth:
                 self.accepted[rows] = True
                 self.noise = self.noise.found(
                     np.array([max(variance, LEAST_RATIO), self.noise.variance[1]]))
-        # A part that no other factor joins is where most of its own absolute factors say.
+        # Place a part that no other factor joins where most of its absolute factors agree.
         placing = (self.accepted | absolute) & ~self.cut if self.cut.any() else self.accepted
         self.poses = placed(self.given.graph.subset(placing), self.poses)
 
     def copy(self) -> 'Growth':
-        """Return a state to try something in."""
+        """Return a copy to try a hypothesis in."""
         clone = copy.copy(self)
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray | dict):
@@ -157,19 +163,19 @@ class Growth:
         return clone
 
     def uncut(self) -> 'Growth':
-        """Return the state, where all odometry says what it measured."""
+        """Return a copy that uses all odometry as measured."""
         state = self.copy()
         state.cut[:] = False
         return state
 
     def subgraph(self, rows: Indices) -> FactorGraph:
-        """Return the graph of some factors, with the noise as it was found."""
-        self._check()  # with this, each long step begins
+        """Return the graph of some factors, weighted by the assumed noise."""
+        self._check()  # each long step begins here
         variance = np.where(self.given.factors.is_absolute[rows, None], 1.0,
                             self.noise.assumed[self.given.is_loop[rows].astype(np.int64)])
         cut = self.cut[rows]
-        # Where loops hold both sides, they alone decide, be it to some hundred sigmas; where
-        # nothing does, it is all there is. Either way the keyframes are where they are.
+        # A cut keeps the current relative pose. Where loops join both sides, it has negligible
+        # information, even to hundreds of sigmas; else it alone ties them.
         low, high = self.given.factors.i[rows[cut]], self.given.factors.j[rows[cut]]
         variance[cut] *= np.where(self.part[low] == self.part[high], 1 / TINY, 1.0)[:, None]
         subgraph = self.given.graph.subset(rows, variance)
@@ -178,38 +184,38 @@ class Growth:
         return subgraph
 
     def take_at_their_word(self) -> None:
-        """From now on let factors be as noisy as they say."""
+        """From now on use max(estimated, stated) covariance."""
         self.noise = replace(self.noise, at_their_word=True)
         self.drops[:] = 0
 
     def undecided(self) -> Indices:
-        """Return the loops within a part that may yet be accepted, (k,)."""
+        """Return the loops within a part that are still open, (k,)."""
         return self._open(~self.across() & self.may_be_predicted)
 
     def joining(self) -> Indices:
-        """Return the loops from one part to another that may yet be accepted, (k,)."""
+        """Return the loops between parts that are still open, (k,)."""
         return self._open(self.across())
 
     def _open(self, some: Mask) -> Indices:
         return np.asarray(np.flatnonzero(some & ~self.accepted & (self.drops < _CHANCES)))
 
     def across(self) -> Mask:
-        """Return which factors lead from one part to another, (m,) bool."""
+        """Return which factors join two parts, (m,) bool."""
         across: Mask = self.part[self.given.low] != self.part[self.given.high]
         return across & ~self.given.factors.is_absolute
 
     def label_parts(self) -> None:
-        """Give each keyframe the number of its part, of what is accepted now."""
+        """Label the connected components of accepted factors without cuts."""
         self.part = component_labels(self.given.graph.subset(self.accepted & ~self.cut))
 
     def accept_more(self) -> None:
-        """Go through the rounds until there is nothing more to accept."""
+        """Run rounds until none accepts a loop."""
         while len(news := self.news()):
             self.accepted[news] = True
             self.solve()
 
     def learn_noise_anew(self) -> None:
-        """Solve, and learn the noise of what is accepted now alone, until it is what it was."""
+        """Estimate the noise from accepted factors alone, until it converges."""
         for _ in range(_LEARNT_ANEW):
             before = self.noise.variance
             self.noise = self.noise.forgotten()
@@ -218,9 +224,9 @@ class Growth:
                 break
 
     def solve(self) -> None:
-        """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
+        """Solve for the accepted factors, drop those that do not fit, estimate the noise."""
         while True:
-            vars(self).pop('posterior', None)  # nearly as large as the factor that is made now
+            vars(self).pop('posterior', None)  # frees nearly a Cholesky factor's memory
             if self.cut.any():
                 self.label_parts()
             rows = np.flatnonzero(self.accepted)
@@ -243,7 +249,7 @@ class Growth:
             self._learn_noise(rows)
 
     def _is_noisier(self, rows: Indices) -> bool:
-        """Raise the variance where half of the factors, checked by others, say it is too small."""
+        """Raise variances that checked residuals show too small; return whether any was."""
         loops = self.given.is_loop[rows]
         if self.noise.is_known(self.accepted) or self.given.may_err_as_one(rows[loops]):
             return False
@@ -259,21 +265,21 @@ class Growth:
         return bool(noisier.any())
 
     def _misfits(self, rows: Indices, residual: Array) -> Indices:
-        """Return the accepted loops that do not fit, or that all others speak against."""
+        """Return accepted loops that fail the gate, also if left out."""
         freedom = self.given.factors.freedom[rows]
         may_go = self.given.is_loop[rows] & ~self.given.trusted[rows]
         far = (residual**2).sum(axis=1) > self.given.gate(freedom)
         against = np.where(may_go, self.posterior.left_out(), 0.0)
-        # Next to a false loop the true ones look bad too: only the worst go.
+        # True loops beside a false one fit badly, too: drop only the worst.
         doubted = self.given.gate(freedom, DOUBT / len(rows))
         far |= against > np.maximum(doubted, against.max(initial=0.0) / 2)
         return np.asarray(rows[far & may_go])
 
     def _learn_noise(self, rows: Indices) -> None:
         """
-        Compare the residuals with what the noise makes of them, for each number of either kind.
+        Estimate variances from residuals and their expectation, by component and kind.
 
-        Absolute factors are as noisy as they say: of theirs a few tell nothing.
+        Absolute factors keep their stated noise: a few do not determine it.
         """
         kind, k = self.given.is_loop[rows].astype(np.int64), self.given.graph.manifold.TANGENT_SIZE
         own = ~self.given.factors.is_absolute[rows]
@@ -283,18 +289,18 @@ class Growth:
         for group in _GROUPS[k]:
             for sums in (found, stated):
                 sums[:, group] = sums[:, group].mean(axis=1, keepdims=True)
-        # Each number is drawn to the mean of all, and that to what is stated.
+        # Shrink each component to the mean of all, and this to the noise assumed before.
         known = FEWEST * k
         mean = ((found.sum(axis=1) + known) / (stated.sum(axis=1) + known))[:, None]
         self.noise = self.noise.learnt((found + known * mean) / (stated + known), self.accepted)
 
     def innovations(self, rows: Indices) -> Innovations:
-        """Return how factors that are not accepted fit the map."""
+        """Return the innovations of factors that are not accepted."""
         widths = claimed_volume(self.given.graph.manifold, self.poses)
         return innovations(self.subgraph(rows), self.poses, self.posterior, widths)
 
     def news(self) -> Indices:
-        """Return the loops to accept next, (k,); in the end what was dropped, all at once."""
+        """Return the loops to accept next, (k,); at the end dropped ones once more."""
         news = self.believable(self.undecided())
         fresh: Indices = news[self.drops[news] == 0]
         if len(fresh):
@@ -303,13 +309,13 @@ class Growth:
         return news
 
     def believable(self, rows: Indices) -> Indices:
-        """Return which of some loops may be accepted: each by itself, or else together, (k,)."""
+        """Return the loops to accept of some: each on its own odds, else in pairs, (k,)."""
         if not len(rows):
             return rows
         found = self.innovations(rows)
         fits = found.square < self.given.gate(found.freedom)
-        # Taken at their word, or by the noise that one run taught, all are noisier than they are,
-        # so that more fit by chance: then only the rest says how many of the rest are false.
+        # With stated noise, or noise from one run, covariances are too large and more loops fit by
+        # chance: estimate the outlier rate from undecided loops alone.
         true = (0 if self.noise.at_their_word or self.ventured.any()
                 else np.count_nonzero(self.loops))
         return np.asarray(rows[believable(
@@ -317,10 +323,10 @@ class Growth:
 
 
 def gain_of_places(growth: Growth, as_stated: Growth, cut: Growth) -> float:
-    """Return what the places say that are won and lost by a cut, ln of odds."""
+    """Return the log odds of a cut by the places it wins and loses."""
     before, explained, after = (np.unique(growth.given.place[state.loops])
                                 for state in (growth, as_stated, cut))
     won = len(np.setdiff1d(after, np.union1d(before, explained)))
-    # Of a place that is long, too, what is lost had to be a mistake.
+    # A place counts if any of its loops is lost, also a long one.
     lost = growth.given.count_places(growth.loops & ~cut.loops)
     return growth.given.log_odds_of_place * (won - lost)

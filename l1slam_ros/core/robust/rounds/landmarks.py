@@ -7,12 +7,12 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The judgement of a graph with landmarks: each sighting as a loop through what it sees.
+Robust solves with landmarks: each sighting is a loop through its landmark.
 
-In: what judges a graph of keyframes. Out: the same for a graph some of whose poses are landmarks.
-One sighting places each landmark, and the landmark follows its keyframe as if odometry led there.
-Any sighting may be an outlier, also the first one: the one is taken that most others agree with,
-by the odometry between their keyframes (pairwise consistency).
+In: a function that judges a graph of keyframes. Out: the same for graphs with landmarks. One
+sighting places each landmark, which follows its keyframe as if by odometry. Any sighting may be an
+outlier: the one is chosen that most others agree with, by the odometry between keyframes (pairwise
+consistency).
 """
 
 from collections.abc import Callable
@@ -30,12 +30,12 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.as_measured import Believed, Judge, OnRound
 from l1slam_ros.core.robust.judgement import Doubt, listed
 
-# A sighting is compared with so many later ones of its landmark.
+# A sighting is compared with this many later ones of its landmark.
 _COMPARED = 20
 
 
 def with_landmarks(judge: Judge) -> Callable[..., Believed]:
-    """Return what judges a graph with landmarks; see `batch.robust_solve`."""
+    """Return a judge of graphs with landmarks."""
     @wraps(judge)
     def judged(graph: FactorGraph, report: OnRound = lambda round_, accepted: None,
                check: Callable[[], None] = lambda: None,
@@ -49,18 +49,18 @@ def with_landmarks(judge: Judge) -> Callable[..., Believed]:
 
 def _judged(judge: Judge, graph: FactorGraph, placing: Indices, report: OnRound,
             check: Callable[[], None], known: Believed | None) -> Believed:
-    """Return the judgement where landmarks are placed by these sightings, rows (l,)."""
+    """Return the judgement with landmarks placed by some sightings, rows (l,)."""
     way, number = along_the_way(graph, placing)
     order = np.argsort(number)
     judgement, poses = judge(way, report, check, known and (known[0], known[1][order]))
-    noise = judgement.noise.copy()  # what places a landmark is a loop as others are
+    noise = judgement.noise.copy()  # weighted as other loops
     noise[placing] = noise[~graph.between.is_odometry].min(initial=np.inf)
     doubts = tuple(_renumbered(doubt, order) for doubt in judgement.doubts)
     return replace(judgement, noise=noise, doubts=doubts), poses[number]
 
 
 def _renumbered(doubt: Doubt, order: Indices) -> Doubt:
-    """Return a doubt where keyframe k is order[k]; a slip lies between the ends of its step."""
+    """Return a doubt with keyframe k as order[k]; a slip is between the ends of its step."""
     first, last = np.sort(order[[doubt.first, doubt.last]]).tolist()
     pairs = order[np.array(doubt.pairs, np.int64).reshape(-1, 2)]
     return replace(doubt, first=first, last=last, pairs=listed(pairs))
@@ -68,12 +68,16 @@ def _renumbered(doubt: Doubt, order: Indices) -> Doubt:
 
 class _Sightings:
     """
-    How well the sightings of each landmark agree by odometry.
+    Sightings of landmarks, and how well they agree by odometry.
 
-    rows, seen, keyframe : see `sightings`; Z, C : (k, p), (k, d, d) the landmark seen from the
-    keyframe and the covariance of that; X : (k, p) the keyframes along the odometry; spread : (k,
-    d, d) covariance of the odometry up to there, as steps at the origin; chain : (k,) of which
-    piece of odometry without a gap the keyframe is.
+    Attributes
+    ----------
+    rows, seen, keyframe : see `sightings`
+    Z, C : (k, p), (k, d, d) landmark seen from the keyframe, and covariance
+    X, spread : (k, p), (k, d, d) keyframe along the odometry, and covariance as steps at the
+        origin
+    chain : (k,) gapless piece of odometry of the keyframe
+
     """
 
     def __init__(self, graph: FactorGraph):
@@ -84,7 +88,7 @@ class _Sightings:
         self._trusted = factors.trusted[self.rows]
         self.Z = factors.measurement[self.rows]
         root = factors.sqrt_information[self.rows]
-        # An outlier may be anywhere where sightings are, turned by anything.
+        # Outliers are uniform over the extent of the sightings and all rotations.
         width = np.full(manifold.TANGENT_SIZE, np.pi**2 / 3)
         width[manifold.TRANSLATION] = 2 * (manifold.positions(self.Z)**2).mean()
         self._log_claim = float(np.log(width).sum())
@@ -97,10 +101,10 @@ class _Sightings:
 
     def likeliest(self) -> Indices:
         """
-        Return of each landmark the sighting that others make most likely, rows (l,).
+        Return the sighting of each landmark with the most support, rows (l,).
 
-        By the sum of ln p(difference) / p(difference by chance) over all that agree with it; of
-        those that nothing tells apart, the first.
+        By the sum of ln p(difference) / p(difference by chance) over those that agree; of equal
+        ones the first.
         """
         score = np.where(self._trusted, np.inf, 0.0)
         for apart in range(1, min(_COMPARED, len(self.rows) - 1) + 1):
@@ -113,7 +117,7 @@ class _Sightings:
         return self.rows[order[np.unique(self.seen[order], return_index=True)[1]]]
 
     def _log_ratio(self, a: Indices, b: Indices) -> Array:
-        """Return how much likelier than chance pairs of sightings agree, ln, (pairs,)."""
+        """Return ln p(difference) / p(difference by chance) of pairs of sightings, (pairs,)."""
         manifold = self._manifold
         way = manifold.compose(manifold.between(self.X[a], self.X[b]), self.Z[b])
         e = manifold.local(self.Z[a], way)
@@ -126,9 +130,9 @@ class _Sightings:
 
 def _odometry(graph: FactorGraph) -> tuple[Array, Array, Indices]:
     """
-    Return poses along the odometry (n, p), covariances up to there (n, d, d), and pieces (n,).
+    Return poses (n, p), covariances (n, d, d), and pieces (n,) along the odometry.
 
-    The covariance is of steps at the origin, from the left, and adds up along the way.
+    Covariances are of steps at the origin, from the left, and add up.
     """
     manifold = graph.manifold
     way, number = by_first_sightings(graph)

@@ -7,10 +7,10 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The noise that a robust solve assumes, of odometry and of loops.
+The noise of odometry and of loops that a robust solve assumes.
 
-In: what factors state, and what is measured of them. Out: the variances to weigh them by, in units
-of what they state. Each step makes another record of the one before.
+In: stated variances and estimates. Out: the variances to weight factors by, in units of the
+stated. Each update returns a new record.
 """
 
 from dataclasses import dataclass, replace
@@ -21,19 +21,23 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.robust.innovation import within_ratio
 
-# What is stated counts in the end up to so many times the variance that was found.
+# In the end, stated variance counts up to this multiple of the estimate.
 _WORD = 100.0
 
 
 @dataclass(frozen=True)
 class Noise:
     """
-    How noisy odometry and loops were found to be.
+    Estimated noise of odometry and of loops.
 
-    stated : (2,) the variance that they state; variance : (2,) theirs in units of that, the mean
-    of their numbers; shape : (2, k) of each number, in units of the mean;
-    learnt_of : (m,) bool, the factors of which it was learnt last, (0,) of none; at_their_word :
-    whether factors may be as noisy as they say.
+    Attributes
+    ----------
+    stated : (2,) stated variance
+    variance : (2,) estimate in units of it, mean over components
+    shape : (2, k) variance of each component relative to the mean
+    learnt_of : (m,) bool, factors of the last estimate, (0,) before
+    at_their_word : use max(estimated, stated) covariance
+
     """
 
     stated: Array
@@ -44,45 +48,45 @@ class Noise:
 
     @staticmethod
     def of(stated: Array, k: int) -> 'Noise':
-        """Return the noise that is stated, of k numbers, of which nothing is learnt."""
+        """Return the stated noise, of k components."""
         return Noise(stated, within_ratio(np.ones(2), stated), np.ones((2, k)), np.zeros(0, bool))
 
     @property
     def assumed(self) -> Array:
-        """(2, k) what factors are weighed by."""
+        """(2, k) variances that weight factors."""
         return self.word if self.at_their_word else self.each
 
     @property
     def each(self) -> Array:
-        """(2, k) the variance of each number."""
+        """(2, k) estimated variances."""
         return self.variance[:, None] * self.shape
 
     @property
     def word(self) -> Array:
-        """(2, k) where factors are as noisy as they say, or as was found."""
+        """(2, k) max(estimated, stated) variance, bounded by `_WORD` and `within_ratio`."""
         word = np.maximum(self.each, np.minimum(_WORD * self.each, 1.0))
         mean = word.mean(axis=1)
         return word * (within_ratio(mean, self.stated) / mean)[:, None]
 
     @property
     def said(self) -> Array:
-        """(2,) how much larger the variance is that factors may have, than was found."""
+        """(2,) mean ratio of `word` to the estimate."""
         return (self.word / self.each).mean(axis=1)
 
     def is_known(self, accepted: Mask) -> bool:
-        """Return whether there is nothing new to learn it of: what it was, says always more."""
+        """Return whether not to estimate it: the same factors would count twice."""
         return self.at_their_word or np.array_equal(accepted, self.learnt_of)
 
     def found(self, variance: Array) -> 'Noise':
-        """Return the noise where its variance, (2,), was found anew."""
+        """Return the noise with a new variance, (2,)."""
         return replace(self, variance=within_ratio(variance, self.stated))
 
     def learnt(self, scale: Array, accepted: Mask) -> 'Noise':
-        """Return the noise so many times as large, (2, k), learnt of what is accepted, (m,)."""
+        """Return the noise scaled by (2, k), estimated from accepted factors, (m,)."""
         each = self.each * scale
         mean = each.mean(axis=1)
         return replace(self.found(mean), shape=each / mean[:, None], learnt_of=accepted.copy())
 
     def forgotten(self) -> 'Noise':
-        """Return the noise as if it were learnt of nothing."""
+        """Return the noise as if estimated from no factors."""
         return replace(self, learnt_of=self.learnt_of[:0])
