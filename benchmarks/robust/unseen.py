@@ -95,8 +95,8 @@ def _references(world: World) -> list[float]:
     return errors
 
 
-def run(number: int) -> list[Record]:
-    """Solve a world by the command, and without its false loops."""
+def run(number: int, references: list[float] | None = None) -> list[Record]:
+    """Solve a world by the command, and, unless the errors are known, without false loops."""
     world = draw(number)
     began = time.perf_counter()
     said, error = _solve(world, np.ones(len(world.pairs), bool))
@@ -104,7 +104,7 @@ def run(number: int) -> list[Record]:
     unused = {tuple(pair) for pair in said.get('rejected', []) + said.get('suspect', [])}
     doubts = sorted({doubt['kind'] for doubt in said.get('doubts', [])})
     refused = np.array([tuple(pair) in unused for pair in world.pairs.tolist()])
-    record = _base(number, world, 'l1slam', _references(world)) | {
+    record = _base(number, world, 'l1slam', references or _references(world)) | {
         'status': said['status'], 'doubts': doubts, 'confidence': said.get('confidence'),
         'doubtful': said['status'] == 'doubtful' or said['status'].startswith('exit'),
         'slips': len(said.get('slips', [])), 'seconds': round(seconds, 3)}
@@ -214,7 +214,8 @@ def _percent(part: int, of: int) -> str:
     return f'{100 * part / of:.1f}%' if of else '-'
 
 
-def _read(files: Iterable[Path]) -> list[Record]:
+def read(files: Iterable[Path]) -> list[Record]:
+    """Return the records of some files."""
     return [json.loads(line) for file in files if file.exists()
             for line in file.read_text().splitlines()]
 
@@ -232,9 +233,9 @@ def main() -> None:
     parser.add_argument('--by', default='family', help='family, lies, noise or information')
     options = parser.parse_args()
     if options.table:
-        table(_read(options.table), options.by)
+        table(read(options.table), options.by)
         return
-    rows = _read([options.out])
+    rows = read([options.out])
     done = {row['number'] for row in rows if row['method'] == (
         PEERS[-1] if options.peers else 'l1slam')}
     numbers = [k for k in range(options.first, options.first + options.count)
