@@ -181,7 +181,9 @@ def test_wrong_arguments_are_named_and_nothing_is_read(k, rng):
             kernel(*arguments)
     tiles = np.ones((1, 2 * k * k + 3 * k, 16), np.float32)
     at, single = np.full((1, 2, 16), 7, np.int32), np.ones((8, k), np.float32)
-    for name, *arguments in (('tiles', tiles[:, 1:].copy(), at, single), ('keyframe', tiles,
-                             at + np.int32(1), single), ('x', tiles, at, np.ones((8, 4), np.float32))):
+    four = np.ones((8, 4), np.float32)
+    for name, *arguments in (('tiles', tiles[:, 1:].copy(), at, single),
+                             ('keyframe', tiles, at + np.int32(1), single),
+                             ('x', tiles, at, four)):
         with pytest.raises(TypeError, match=rf'{name}\b.* must '):
             native.halpern.iterate(*arguments, *np.ones((2, 8, k), np.float32), 1.0, 0, 1)
