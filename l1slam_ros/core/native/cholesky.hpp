@@ -127,8 +127,9 @@ inline void subtract_blocks(double* panels, int64_t begin, int64_t width, const 
     const double* source = panels + begin;
     Lanes<4> right[PLANE];
     for (int q = 0; q < PLANE; q++) {
-        const double column[4] = {source[q], source[width + q], source[2 * width + q], 0.0};
-        right[q] = Lanes<4>::load(column);
+        right[q] = Lanes<4>::zero();
+        for (int r = 0; r < PLANE; r++)
+            right[q].part[r / Lanes<4>::W][r % Lanes<4>::W] = source[width * r + q];
     }
     for (int64_t k = 0; k < count; k++) {
         const double* block = source + width * PLANE * k;
@@ -276,9 +277,10 @@ class Factorisation {
         const int64_t k = shape.k, begin = shape.offset[s], stride = shape.stride[s];
         const int64_t width = shape.columns(s) * k, height = shape.rows(s) * k;
         const int32_t* rows = &shape.pattern[shape.start[s]];
-        for (int64_t r = 0; r < shape.rows(s); r++) own.local[rows[r]] = begin + r * k * stride;
-        for (int64_t c = 0; c < width; c++)
-            own.least[c] = SINGULAR * panels[begin + c * (stride + 1)];
+        int64_t* local = own.local.data();
+        double* least = own.least.data();
+        for (int64_t r = 0; r * k < height; r++) local[rows[r]] = begin + r * k * stride;
+        for (int64_t c = 0; c < width; c++) least[c] = SINGULAR * panels[begin + c * (stride + 1)];
         for (int64_t source = head[s]; source >= 0;) {
             const int64_t behind = next[source];
             reach[source] += subtract_source(source, s, own);
@@ -286,36 +288,38 @@ class Factorisation {
             source = behind;
         }
         return width == PLANE
-            ? factorise_block(panels + begin, stride, height, own.least.data())
-            : factorise_panel(panels, begin, stride, height, width, own.least.data(),
+            ? factorise_block(panels + begin, stride, height, least)
+            : factorise_panel(panels, begin, stride, height, width, least,
                               own.place.data(), own.target.data(), own.packed.data());
     }
 
     // Subtract what an earlier supernode has for supernode s; return of how many block columns.
     int64_t subtract_source(int64_t source, int64_t s, Work& own) {
-        const int64_t k = shape.k, step = shape.stride[source];
+        const int64_t k = shape.k, step = shape.stride[source], stride = shape.stride[s];
+        const int64_t first = shape.first[s], end = shape.first[s + 1];
+        const int64_t* local = own.local.data();
+        int64_t *place = own.place.data(), *target = own.target.data();
         const int32_t* below = &shape.pattern[shape.start[source] + reach[source]];
         const int64_t many = shape.rows(source) - reach[source];
         const int64_t inner = shape.columns(source) * k;
         const int64_t top = shape.offset[source] + reach[source] * k * step;
         int64_t columns = 0;
-        while (columns < many && below[columns] < shape.first[s + 1]) columns++;
+        while (columns < many && below[columns] < end) columns++;
         if (k == PLANE && inner <= THIN) {
             for (int64_t c = 0; c < columns; c++)
                 for (int64_t q = top; q < top + inner; q += PLANE)
-                    subtract_blocks(panels, q + c * PLANE * step, step, below + c, many - c,
-                                    own.local.data(), (below[c] - shape.first[s]) * PLANE,
-                                    shape.stride[s]);
+                    subtract_blocks(panels, q + c * PLANE * step, step, below + c, many - c, local,
+                                    (below[c] - first) * PLANE, stride);
             return columns;
         }
         for (int64_t r = 0; r < many; r++)
             for (int64_t a = 0; a < k; a++)
-                own.place[r * k + a] = own.local[below[r]] + a * shape.stride[s];
+                place[r * k + a] = local[below[r]] + a * stride;
         for (int64_t c = 0; c < columns; c++)
             for (int64_t a = 0; a < k; a++)
-                own.target[c * k + a] = (below[c] - shape.first[s]) * k + a;
-        subtract(panels + top, step, inner, many * k, columns * k, panels, own.place.data(),
-                 own.target.data(), own.packed.data());
+                target[c * k + a] = (below[c] - first) * k + a;
+        subtract(panels + top, step, inner, many * k, columns * k, panels, place, target,
+                 own.packed.data());
         return columns;
     }
 };
