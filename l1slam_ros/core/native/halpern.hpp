@@ -14,6 +14,7 @@
 
 #include "arrays.hpp"
 #include "blocks.hpp"
+#include "lanes.hpp"
 
 namespace halpern {
 
@@ -48,12 +49,11 @@ inline void invert_root(double* gram, int64_t k) {
         for (int64_t b = 0; b < a; b++) at(a, b) = 0.0;
 }
 
-// The blocks in scaled unknowns, (m, 2, k, k), and R_v^-1 of each of n keyframes, (n, k, k).
-inline std::tuple<Array<double, 4>, Array<double, 3>> scale(blocks::Keyframes keyframe,
-                                                            blocks::Blocks blocks, int64_t n) {
-    blocks::check(keyframe, blocks);
-    require(n >= 0, "n must not be negative");
-    const int64_t m = blocks.size(), k = blocks.shape[3];
+using Scaled = std::tuple<Array<double, 4>, Array<double, 3>>;
+
+template <int K>
+Scaled scale_sized(blocks::Keyframes keyframe, blocks::Blocks blocks, int64_t n) {
+    const int64_t m = blocks.size(), k = K ? K : blocks.shape[3];
     auto inverse = new_array<double, 3>({n, k, k});
     auto scaled = new_array<double, 4>({m, 2, k, k});
     std::fill_n(inverse.data, n * k * k, 0.0);
@@ -83,11 +83,45 @@ inline std::tuple<Array<double, 4>, Array<double, 3>> scale(blocks::Keyframes ke
     return {scaled, inverse};
 }
 
+// The blocks in scaled unknowns, (m, 2, k, k), and R_v^-1 of each of n keyframes, (n, k, k).
+inline Scaled scale(blocks::Keyframes keyframe, blocks::Blocks blocks, int64_t n) {
+    blocks::check(keyframe, blocks);
+    require(n >= 0, "n must not be negative");
+    return FOR_SIZE(blocks.shape[3], scale_sized, keyframe, blocks, n);
+}
+
 // tiles : (tiles, rows, LANES); keyframe : (tiles, 2, LANES); steps : (n + 1, k), the last row of
 // what is held fixed.
 using Tiles = Array<float, 3>;
 using Keyframes = Array<const int32_t, 3>;
 using Steps = Matrix<float>;
+
+// A number of each factor of a tile, in registers.
+struct Row {
+    static constexpr int WIDE = 2 * WIDTH, PARTS = LANES / WIDE;
+    typedef float Register __attribute__((vector_size(4 * WIDE)));
+    typedef float Unaligned __attribute__((vector_size(4 * WIDE), aligned(4), may_alias));
+    Register part[PARTS];
+
+    static INLINE Row zero() {
+        Row all;
+        UNROLL for (int p = 0; p < PARTS; p++) all.part[p] = Register{};
+        return all;
+    }
+    static INLINE Row load(const float* from) {
+        Row all;
+        UNROLL for (int p = 0; p < PARTS; p++)
+            all.part[p] = *reinterpret_cast<const Unaligned*>(from + p * WIDE);
+        return all;
+    }
+    INLINE void store(float* to) const {
+        UNROLL for (int p = 0; p < PARTS; p++)
+            *reinterpret_cast<Unaligned*>(to + p * WIDE) = part[p];
+    }
+    INLINE void add(const Row& one, const Row& other) {
+        UNROLL for (int p = 0; p < PARTS; p++) part[p] += one.part[p] * other.part[p];
+    }
+};
 
 // What the loops have in common, k rows of a block.
 template <int K> struct Tile {
@@ -105,27 +139,31 @@ template <int K> struct Tile {
     static void scatter(const float (*tile)[LANES], const float (*y)[LANES],
                         const int32_t* keyframe, Steps g) {
         float product[2 * K][LANES];
-        for (int side = 0; side < 2; side++)
-            for (int c = 0; c < K; c++) {
-                float* total = product[side * K + c];
-                for (int lane = 0; lane < LANES; lane++) total[lane] = 0;
-                for (int r = 0; r < K; r++)
-                    for (int lane = 0; lane < LANES; lane++)
-                        total[lane] += tile[(side * K + r) * K + c][lane] * y[r][lane];
-            }
+        Row rows[K];
+        UNROLL for (int r = 0; r < K; r++) rows[r] = Row::load(y[r]);
+        for (int c = 0; c < 2 * K; c++) {
+            const int at = c < K ? c : K * K + c - K;  // its block's first row
+            Row total = Row::zero();
+            UNROLL for (int r = 0; r < K; r++) total.add(Row::load(tile[at + r * K]), rows[r]);
+            total.store(product[c]);
+        }
         for (int side = 0; side < 2; side++)
             for (int lane = 0; lane < LANES; lane++) {
                 float* to = g[keyframe[side * LANES + lane]];
                 for (int c = 0; c < K; c++) to[c] += product[side * K + c][lane];
             }
     }
-    // Row r of A x.
-    static void multiply(const float (*tile)[LANES], const float (*x)[LANES], int r, float* row) {
-        for (int lane = 0; lane < LANES; lane++) row[lane] = 0;
-        for (int side = 0; side < 2; side++)
-            for (int c = 0; c < K; c++)
-                for (int lane = 0; lane < LANES; lane++)
-                    row[lane] += tile[(side * K + r) * K + c][lane] * x[side * K + c][lane];
+    // A x, all rows at once: each sum waits for the one before.
+    static void multiply(const float (*tile)[LANES], const float (*x)[LANES],
+                         float (*product)[LANES]) {
+        Row total[K];
+        UNROLL for (int r = 0; r < K; r++) total[r] = Row::zero();
+        for (int c = 0; c < 2 * K; c++) {
+            const int at = c < K ? c : K * K + c - K;
+            const Row of_x = Row::load(x[c]);
+            UNROLL for (int r = 0; r < K; r++) total[r].add(Row::load(tile[at + r * K]), of_x);
+        }
+        UNROLL for (int r = 0; r < K; r++) total[r].store(product[r]);
     }
     template <class T> static T (*tile(Array<T, 3> tiles, int64_t t))[LANES] {
         return reinterpret_cast<T(*)[LANES]>(tiles[t]);
@@ -166,7 +204,7 @@ void iterate_sized(Tiles tiles, Keyframes keyframe, Steps x, Steps z, Steps g, d
                    int64_t first, int64_t count) {
     using Tile = halpern::Tile<K>;
     const float w = float(weight), twice = float(2 / weight);
-    float local[2 * K][LANES], y[K][LANES];
+    float local[2 * K][LANES], Ax[K][LANES], y[K][LANES];
     for (int64_t iteration = first; iteration < first + count; iteration++) {
         const float a = float((iteration + 1.0) / (iteration + 2.0));
         const float rest = float(1.0 / (iteration + 2.0));
@@ -174,11 +212,11 @@ void iterate_sized(Tiles tiles, Keyframes keyframe, Steps x, Steps z, Steps g, d
         for (int64_t t = 0; t < tiles.size(); t++) {
             auto tile = Tile::tile(tiles, t);
             Tile::gather(z, keyframe[t], local);
+            Tile::multiply(tile, local, Ax);
             for (int r = 0; r < K; r++) {
-                float Ax[LANES], *own = tile[Tile::Y + r];
-                Tile::multiply(tile, local, r, Ax);
+                float* own = tile[Tile::Y + r];
                 for (int lane = 0; lane < LANES; lane++) {
-                    const float residual = Ax[lane] - tile[Tile::B + r][lane], was = own[lane];
+                    const float residual = Ax[r][lane] - tile[Tile::B + r][lane], was = own[lane];
                     const float bar = std::min(std::max(was + w * residual, -1.0f), 1.0f);
                     y[r][lane] = a * (bar + bar - was) + rest * tile[Tile::START + r][lane];
                     own[lane] = y[r][lane];
@@ -216,27 +254,26 @@ Look look_sized(Tiles tiles, Keyframes keyframe, Steps x, Steps g, double weight
         moved += double(step[j]) * step[j];
         g_bar.data[j] = 0;
     }
-    float local[2 * K][LANES], change[2 * K][LANES];
+    float local[2 * K][LANES], change[2 * K][LANES], Ax[K][LANES], Ad[K][LANES];
     for (int64_t t = 0; t < tiles.size(); t++) {
         auto tile = Tile::tile(tiles, t);
         auto y = Tile::tile(y_bar, t);
         Tile::gather(x_bar, keyframe[t], local);
         Tile::gather(d, keyframe[t], change);
-        for (int r = 0; r < K; r++) {
-            float Ax[LANES], Ad[LANES];
-            Tile::multiply(tile, local, r, Ax);
-            Tile::multiply(tile, change, r, Ad);
+        Tile::multiply(tile, local, Ax);
+        Tile::multiply(tile, change, Ad);
+        for (int r = 0; r < K; r++)
             for (int lane = 0; lane < LANES; lane++) {
                 const float b = tile[Tile::B + r][lane], was = tile[Tile::Y + r][lane];
-                const float residual = Ax[lane] - b;
-                const float now = std::min(std::max(was + w * (residual - Ad[lane]), -1.0f), 1.0f);
+                const float residual = Ax[r][lane] - b;
+                const float now =
+                    std::min(std::max(was + w * (residual - Ad[r][lane]), -1.0f), 1.0f);
                 turned += double(now - was) * (now - was);
-                crossed += double(now - was) * Ad[lane];
+                crossed += double(now - was) * Ad[r][lane];
                 cost += std::abs(residual);
                 value -= double(b) * now;
                 y[r][lane] = now;
             }
-        }
         Tile::scatter(tile, y, keyframe[t], g_bar);
     }
     return {weight * moved + turned / weight + 2 * crossed, cost, value};

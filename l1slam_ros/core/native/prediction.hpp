@@ -194,15 +194,20 @@ struct Normalised {
 
 // Turn C (k, k) into its Cholesky factor L, and find u = L^-1 r. whole : (k,) the diagonal of which
 // a pivot is a part. Where C is not definite beyond rounding, infinity and minus infinity.
-inline Normalised normalised(double* C, int64_t k, const double* whole, const double* residual,
+// K : rows, 0: any number of them, k.
+template <int K>
+INLINE Normalised normalised(double* C, int64_t any, const double* whole, const double* residual,
                              double* u) {
+    const int64_t k = K ? K : any;
     Normalised found{0.0, 0.0};
+    double inverse[K ? K : 1];  // of the diagonal of L
+    double product = 1.0;  // of pivots: logarithms take longest
     for (int64_t r = 0; r < k; r++) {
         double* row = C + r * k;
         for (int64_t c = 0; c < r; c++) {
             double value = row[c];
             for (int64_t e = 0; e < c; e++) value -= row[e] * C[c * k + e];
-            row[c] = value / C[c * k + c];
+            row[c] = K ? value * inverse[K ? c : 0] : value / C[c * k + c];
         }
         double value = row[r], total = residual[r];
         for (int64_t e = 0; e < r; e++) value -= row[e] * row[e], total -= row[e] * u[e];
@@ -211,10 +216,14 @@ inline Normalised normalised(double* C, int64_t k, const double* whole, const do
             return {infinity, -infinity};
         }
         row[r] = std::sqrt(value);
+        if constexpr (K > 0) inverse[r] = 1 / row[r];
         u[r] = total / row[r];
         found.square += u[r] * u[r];
-        found.log_det += 2 * std::log(row[r]);
+        product *= value;
+        if (!(product > 1e-100 && product < 1e100))
+            found.log_det += std::log(product), product = 1.0;
     }
+    found.log_det += std::log(product);
     return found;
 }
 
@@ -226,18 +235,65 @@ inline void check(Array<const double, 3> covariance, Matrix<const double> residu
             covariance.shape[2] == k, "covariance must be (m, k, k), residual (m, k)");
 }
 
-// r'C^-1 r and ln det C of each factor, (m,) each; C (m, k, k).
-inline Squares normalise(Array<const double, 3> covariance, Matrix<const double> residual) {
-    check(covariance, residual);
-    const int64_t m = residual.size(), k = residual.shape[1];
+template <int K>
+Squares normalise_sized(Array<const double, 3> covariance, Matrix<const double> residual) {
+    const int64_t m = residual.size(), k = K ? K : residual.shape[1];
     auto square = new_vector<double>(m), log_det = new_vector<double>(m);
     std::vector<double> factor(k * k), whole(k), u(k);
     for (int64_t f = 0; f < m; f++) {
         std::copy_n(covariance[f], k * k, factor.data());
         for (int64_t r = 0; r < k; r++) whole[r] = factor[r * (k + 1)];
         const Normalised found =
-            normalised(factor.data(), k, whole.data(), residual[f], u.data());
+            normalised<K>(factor.data(), k, whole.data(), residual[f], u.data());
         square[f] = found.square, log_det[f] = found.log_det;
+    }
+    return {square, log_det};
+}
+
+// r'C^-1 r and ln det C of each factor, (m,) each; C (m, k, k).
+inline Squares normalise(Array<const double, 3> covariance, Matrix<const double> residual) {
+    check(covariance, residual);
+    return FOR_SIZE(residual.shape[1], normalise_sized, covariance, residual);
+}
+
+template <int K>
+Squares normalise_pairs_sized(Array<const double, 3> covariance, Matrix<const double> residual,
+                              Matrix<const double> shared, Vector<const int64_t> first,
+                              Vector<const int64_t> second) {
+    const int64_t m = residual.size(), k = K ? K : residual.shape[1], pairs = first.size();
+    auto square = new_vector<double>(pairs), log_det = new_vector<double>(pairs);
+    std::vector<double> factor(covariance.data, covariance.data + m * k * k);
+    std::vector<double> whole(m * k), u(m * k), inverse(m * k);
+    std::vector<Normalised> own(m);
+    for (int64_t f = 0; f < m; f++) {
+        double* L = &factor[f * k * k];
+        for (int64_t r = 0; r < k; r++) whole[f * k + r] = L[r * (k + 1)];
+        own[f] = normalised<K>(L, k, &whole[f * k], residual[f], &u[f * k]);
+        for (int64_t r = 0; r < k; r++) inverse[f * k + r] = 1 / L[r * (k + 1)];
+    }
+    // Of the second one what the first one does not explain: C - W'W, W = L^-1 of what they share.
+    std::vector<double> W(k * k), C(k * k), left(k), unused(k);
+    for (int64_t pair = 0; pair < pairs; pair++) {
+        const int64_t a = first[pair], b = second[pair];
+        const double *L = &factor[a * k * k], *between = &shared(a * k, b * k);
+        std::copy_n(covariance[b], k * k, C.data());
+        std::copy_n(residual[b], k, left.data());
+        for (int64_t r = 0; r < k; r++) {
+            double* row = &W[r * k];
+            for (int64_t c = 0; c < k; c++) row[c] = between[r * m * k + c];
+            for (int64_t e = 0; e < r; e++)
+                for (int64_t c = 0; c < k; c++) row[c] -= L[r * k + e] * W[e * k + c];
+            for (int64_t c = 0; c < k; c++) {
+                row[c] *= inverse[a * k + r];
+                left[c] -= row[c] * u[a * k + r];
+            }
+            for (int64_t d = 0; d < k; d++)
+                for (int64_t c = 0; c < k; c++) C[d * k + c] -= row[d] * row[c];
+        }
+        const Normalised more =
+            normalised<K>(C.data(), k, &whole[b * k], left.data(), unused.data());
+        square[pair] = own[a].square + more.square;
+        log_det[pair] = own[a].log_det + more.log_det;
     }
     return {square, log_det};
 }
@@ -256,39 +312,7 @@ inline Squares normalise_pairs(Array<const double, 3> covariance, Matrix<const d
     for (int64_t pair = 0; pair < pairs; pair++)
         fits &= first[pair] >= 0 && first[pair] < m && second[pair] >= 0 && second[pair] < m;
     require(fits, "first and second must be rows of residual");
-    auto square = new_vector<double>(pairs), log_det = new_vector<double>(pairs);
-    std::vector<double> factor(covariance.data, covariance.data + m * k * k);
-    std::vector<double> whole(m * k), u(m * k);
-    std::vector<Normalised> own(m);
-    for (int64_t f = 0; f < m; f++) {
-        for (int64_t r = 0; r < k; r++) whole[f * k + r] = factor[f * k * k + r * (k + 1)];
-        own[f] = normalised(&factor[f * k * k], k, &whole[f * k], residual[f], &u[f * k]);
-    }
-    // Of the second one what the first one does not explain.
-    std::vector<double> W(k * k), C(k * k), left(k), unused(k);
-    for (int64_t pair = 0; pair < pairs; pair++) {
-        const int64_t a = first[pair], b = second[pair];
-        const double *L = &factor[a * k * k], *of_b = covariance[b];
-        for (int64_t c = 0; c < k; c++) {
-            left[c] = residual(b, c);
-            for (int64_t r = 0; r < k; r++) {
-                double value = shared(a * k + r, b * k + c);
-                for (int64_t e = 0; e < r; e++) value -= L[r * k + e] * W[c * k + e];
-                W[c * k + r] = value / L[r * (k + 1)];
-                left[c] -= W[c * k + r] * u[a * k + r];
-            }
-            for (int64_t r = 0; r <= c; r++) {
-                double value = of_b[c * k + r];
-                for (int64_t e = 0; e < k; e++) value -= W[c * k + e] * W[r * k + e];
-                C[c * k + r] = value;
-            }
-        }
-        const Normalised more =
-            normalised(C.data(), k, &whole[b * k], left.data(), unused.data());
-        square[pair] = own[a].square + more.square;
-        log_det[pair] = own[a].log_det + more.log_det;
-    }
-    return {square, log_det};
+    return FOR_SIZE(k, normalise_pairs_sized, covariance, residual, shared, first, second);
 }
 
 static PyMethodDef methods[] = {
