@@ -37,17 +37,16 @@ from l1slam_ros.core.kernels.kept import objects
 from l1slam_ros.io.progress import Progress
 
 # Modules of `kernels` for a sparse graph, for judging loops, for a dense graph, and for a graph
-# that grows. Those that take long to compile come first.
-SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
-JUDGEMENT = ('prediction',)
-DENSE = ('halpern',)
+# that grows.
+SPARSE = ('ordering', 'symbolic')
+JUDGEMENT: tuple[str, ...] = ()
+DENSE: tuple[str, ...] = ()
 ONLINE = ('border', 'growth.elimination', 'growth.points')
 # Modules of `core` for matching scans.
 SCANS = ('scans.kernels', 'scans.search_kernels')
-STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
+STEPS = (*ONLINE, *SPARSE)
 # What poses in space need in addition: versions of a module's loops for arrays of other sizes.
-IN_SPACE = {'halpern': f'halpern{objects.SPACE}', 'blocks': f'blocks{objects.SPACE}',
-            'se2': 'se3'}
+IN_SPACE: dict[str, str] = {}
 
 # Least number of steps for each process: importing numba takes as long as one step.
 _STEPS_EACH = 3

@@ -21,9 +21,10 @@ from systems import (
 )
 
 from l1slam_ros.core.errors import FillError
-from l1slam_ros.core.kernels.prediction import SAMPLES
+from l1slam_ros.core.robust.innovation import SAMPLES
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, find_pattern
 
+pytestmark = pytest.mark.usefixtures('level')
 N = 26
 
 

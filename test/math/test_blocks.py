@@ -13,8 +13,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from systems import SHAPES, random_system
 
-from l1slam_ros.core.kernels import blocks as kernels
+from l1slam_ros.core import native
 
+pytestmark = pytest.mark.usefixtures('level')
 SIZES = [1, 2, 3, 6]
 
 
@@ -46,10 +47,10 @@ def test_the_matrix_has_the_blocks_in_their_places_and_products_are_its_own(syst
 def test_vectors_and_jacobians_are_whitened(k, rng):
     roots, J = np.triu(rng.standard_normal((7, k, k))), rng.standard_normal((7, 2, k, k))
     e = rng.standard_normal((7, k))
-    assert_allclose(kernels.whiten(roots, e, (0,) * k), np.einsum('frc,fc->fr', roots, e),
+    assert_allclose(native.blocks.whiten(roots, e), np.einsum('frc,fc->fr', roots, e),
                     atol=1e-12)
-    assert_allclose(kernels.unwhiten_dual(roots, e, (0,) * k),
+    assert_allclose(native.blocks.unwhiten_dual(roots, e),
                     np.einsum('fcr,fc->fr', roots, e), atol=1e-12)
     blocks = J.copy()
-    kernels.whiten_blocks(roots, blocks, (0,) * k)
+    native.blocks.whiten_blocks(roots, blocks)
     assert_allclose(blocks, roots[:, None] @ J, atol=1e-12)

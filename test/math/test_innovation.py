@@ -13,8 +13,8 @@ import pytest
 from worlds import made
 
 import l1slam_ros as l1
+from l1slam_ros.core import native
 from l1slam_ros.core.graph.linear_system import linearise
-from l1slam_ros.core.kernels.prediction import normalise_pairs
 from l1slam_ros.core.robust.innovation import (
     TAIL,
     chi2_quantile,
@@ -125,7 +125,7 @@ def test_pairs_are_normalised_as_their_whole_covariance_says(k, rng):
     first, second = np.triu_indices(m, 1)
     first, second = np.append(second, first), np.append(first, second)  # either way round
     blocks = shared.reshape(m, k, m, k)[np.arange(m), :, np.arange(m)] + np.eye(k)
-    square, log_det = normalise_pairs(blocks, residual, shared, first, second)
+    square, log_det = native.prediction.normalise_pairs(blocks, residual, shared, first, second)
     rows = np.arange(m * k).reshape(m, k)
     for a, b, found, log in zip(first, second, square, log_det, strict=True):
         own = np.append(rows[a], rows[b])
@@ -136,7 +136,7 @@ def test_pairs_are_normalised_as_their_whole_covariance_says(k, rng):
 
 def test_a_pair_that_is_not_definite_is_infinitely_far_off():
     shared = np.full((6, 6), 2.0)
-    square, log_det = normalise_pairs(
+    square, log_det = native.prediction.normalise_pairs(
         np.stack((np.eye(3), np.eye(3))), np.ones((2, 3)), shared, np.array([0]), np.array([1]))
     assert square == np.inf and log_det == -np.inf
 

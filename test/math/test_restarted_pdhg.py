@@ -20,6 +20,7 @@ from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions
 from l1slam_ros.core.solvers.restarted_pdhg import minimise_l1_halpern, scaled_system
 
+pytestmark = pytest.mark.usefixtures('level')
 SIZES = pytest.mark.parametrize('k', [1, 2, 3, 6])
 
 

@@ -15,7 +15,7 @@ al., "A Tutorial on Graph-Based SLAM" (2010), sections IV and V, with the step o
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array
 
 NAME = 'SE2'
@@ -94,7 +94,7 @@ def adjoint(pose: Array) -> Array:
 
 def residual(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     """Return t2v(Z^-1 Xi^-1 Xj), (n, 3)."""
-    return kernels.se2.residual(measurement, pose_i, pose_j)
+    return native.se2.residual(measurement, pose_i, pose_j)
 
 
 def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
@@ -104,7 +104,7 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> Arra
     With t = Ri'(tj - ti): `J_r_i = [[-Rz', Rz'(t_y, -t_x)'], [0, -1]]` and
     `J_r_j = [[Rz' Ri' Rj, 0], [0, 1]]`.
     """
-    return kernels.se2.jacobians(measurement, pose_i, pose_j)
+    return native.se2.jacobians(measurement, pose_i, pose_j)
 
 
 def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: Array) -> Array:
@@ -116,7 +116,7 @@ def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: A
     (theta_i, y_i) = -m_x, (theta_i, theta_i) = -m.t, (theta_i, x_j) = -h_y,
     (theta_i, y_j) = h_x. The residual is linear in all else.
     """
-    return kernels.se2.curvature(measurement, pose_i, pose_j, dual)
+    return native.se2.curvature(measurement, pose_i, pose_j, dual)
 
 
 def local_jacobian(a: Array, b: Array) -> Array:

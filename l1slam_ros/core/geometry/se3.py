@@ -17,7 +17,7 @@ kinematics for the error-state Kalman filter" (2017).
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array
 
 NAME = 'SE3'
@@ -145,7 +145,7 @@ def adjoint(pose: Array) -> Array:
 
 def residual(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     """Return (t, 2 q_v) of Z^-1 Xi^-1 Xj, (n, 6)."""
-    return kernels.se3.residual(measurement, pose_i, pose_j)
+    return native.se3.residual(measurement, pose_i, pose_j)
 
 
 def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
@@ -155,7 +155,7 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> Arra
     With p = Ri'(tj - ti), Rij = Ri'Rj, q the quaternion of the error and M = q_w I + [q_v]x:
     `J_r_i = [[-Rz', Rz'[p]x], [0, -M Rij']]` and `J_r_j = [[Rz' Rij, 0], [0, M]]`.
     """
-    return kernels.se3.jacobians(measurement, pose_i, pose_j)
+    return native.se3.jacobians(measurement, pose_i, pose_j)
 
 
 def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: Array) -> Array:
@@ -167,7 +167,7 @@ def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: A
     `(om_i, om_i) = (m p' + p m')/2 - (m.p + q_v.y/2) I`, `(om_j, om_j) = -(q_v.y)/2 I`,
     `(om_i, om_j) = Rij ((q_v.y) I + [q_w y - q_v x y]x)/2`. The residual is linear in all else.
     """
-    return kernels.se3.curvature(measurement, pose_i, pose_j, dual)
+    return native.se3.curvature(measurement, pose_i, pose_j, dual)
 
 
 def local_jacobian(a: Array, b: Array) -> Array:

@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import (
@@ -76,10 +76,9 @@ class GraphProblem:
     def curvature(self, poses: Array, dual: Array) -> Array:
         """Return the Hessian of dual'e for each factor, (m, 2, r, 2 k), see `Manifold`."""
         manifold, factors = self.graph.manifold, self.graph.between
-        k = manifold.TANGENT_SIZE
         # That of the residual before it is whitened: L y.
-        dual = kernels.blocks.unwhiten_dual(
-            factors.sqrt_information, dual.reshape(-1, k), (0,) * k)
+        dual = native.blocks.unwhiten_dual(
+            factors.sqrt_information, dual.reshape(-1, manifold.TANGENT_SIZE))
         return manifold.residual_curvature(factors.measurement, *ends(self.graph, poses), dual)
 
 

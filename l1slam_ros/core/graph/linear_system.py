@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import kernels, native
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import FactorGraph, lowest_joined
 
@@ -75,20 +75,14 @@ class LinearSystem:
 
     def times(self, x: Array) -> Array:
         """Return A x, (rows,)."""
-        k = self.block_size
-        padded = np.zeros((self.size + 1, k))
-        padded[:-1] = x.reshape(-1, k)
-        product = np.empty((len(self.blocks), k))
-        kernels.blocks.multiply(self.keyframe, self.blocks, padded, product, size_of_blocks(k))
-        return product.ravel()
+        step = x.reshape(self.size, self.block_size)
+        return native.blocks.multiply(self.keyframe, self.blocks, step).ravel()
 
     def transposed_times(self, y: Array) -> Array:
         """Return A'y, (columns,)."""
-        k = self.block_size
-        product = np.zeros((self.size + 1, k))
-        kernels.blocks.multiply_transposed(self.keyframe, self.blocks, y.reshape(-1, k), product,
-                                           size_of_blocks(k))
-        return product[:-1].ravel()
+        rows = y.reshape(-1, self.block_size)
+        return native.blocks.multiply_transposed(
+            self.keyframe, self.blocks, rows, self.size).ravel()
 
     def diagonal(self, weights: Array) -> Array:
         """Return the diagonal of A'WA, (columns,); weights : (rows,)."""
@@ -96,24 +90,16 @@ class LinearSystem:
 
     def weighted(self, roots: Array) -> 'LinearSystem':
         """Return the system with the rows of each factor multiplied by its root (m, k, k)."""
-        k = self.block_size
-        roots = np.ascontiguousarray(roots)
-        blocks = self.blocks.copy()
-        kernels.blocks.whiten_blocks(roots, blocks, (0,) * k)
-        return replace(self, blocks=blocks,
-                       b=kernels.blocks.whiten(roots, self.b.reshape(-1, k), (0,) * k).ravel())
+        roots, blocks = np.ascontiguousarray(roots), self.blocks.copy()
+        native.blocks.whiten_blocks(roots, blocks)
+        b = native.blocks.whiten(roots, self.b.reshape(-1, self.block_size))
+        return replace(self, blocks=blocks, b=b.ravel())
 
     def part(self, entries: slice) -> 'LinearSystem':
         """Return the system of only these rows of each factor and columns of each keyframe."""
         blocks = np.ascontiguousarray(self.blocks[:, :, entries, entries])
         b = self.b.reshape(len(blocks), self.block_size)[:, entries].ravel()
         return LinearSystem(self.keyframe, blocks, b, self.size)
-
-
-def size_of_blocks(k: int) -> tuple[int, ...] | Array:
-    """Return what tells the compiled loops the size of a block, see `kernels.cholesky`."""
-    # Blocks of whole poses are worth loops of their own.
-    return (0,) * k if k in (3, 6) else np.zeros(k)
 
 
 def anchor(graph: FactorGraph) -> int:
@@ -154,8 +140,7 @@ def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
     """Return the whitened residual of every row, (rows,), in the order of `LinearSystem`."""
     manifold, factors = graph.manifold, graph.between
     e = manifold.residual(factors.measurement, *ends(graph, poses))
-    return kernels.blocks.whiten(
-        factors.sqrt_information, e, (0,) * manifold.TANGENT_SIZE).ravel()
+    return native.blocks.whiten(factors.sqrt_information, e).ravel()
 
 
 def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,
@@ -172,8 +157,7 @@ def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,
     """
     factors = graph.between
     blocks = graph.manifold.residual_jacobians(factors.measurement, *ends(graph, poses))
-    kernels.blocks.whiten_blocks(
-        factors.sqrt_information, blocks, (0,) * graph.manifold.TANGENT_SIZE)
+    native.blocks.whiten_blocks(factors.sqrt_information, blocks)
     if residual is None:
         residual = whitened_residual(graph, poses)
     fixed = anchor(graph) if fixed is None else fixed

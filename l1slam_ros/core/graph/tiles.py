@@ -20,22 +20,28 @@ from numpy.typing import NDArray
 from l1slam_ros.core.geometry.manifold import Array, Indices
 
 Single = NDArray[np.float32]
+# Factors in a tile: one cache line of single precision, as `native.halpern` has it.
+LANES = 16
 
 
 class Tiles:
     """
     The order of the factors in tiles.
 
-    keyframe : (m, 2) as of `LinearSystem`; size : free keyframes; lanes : factors in a tile
+    keyframe : (t, 2, lanes) of each factor, in the order of the tiles
+
+    Parameters
+    ----------
+    keyframe : (m, 2) as of `LinearSystem`
+    size : free keyframes
+
     """
 
-    def __init__(self, keyframe: Indices, size: int, lanes: int):
-        self._lanes = lanes
+    def __init__(self, keyframe: Indices, size: int):
         self._order = np.argsort(keyframe[:, 0] * (size + 1) + keyframe[:, 1], kind='stable')
         self._place = np.empty_like(self._order)
         self._place[self._order] = np.arange(len(keyframe))
-        keyframes = self._side_by_side(keyframe, np.uint32, size)
-        self.keyframes = keyframes.reshape(-1, 2 * lanes)
+        self.keyframe = self._side_by_side(keyframe, np.int32, size)
 
     def pack(self, values: Array) -> Single:
         """Return the values of all factors, (m, c), as tiles (t, c, lanes)."""
@@ -49,8 +55,8 @@ class Tiles:
     def _side_by_side(self, values: np.ndarray, dtype: type, rest: int) -> np.ndarray:
         """Return values (m, c) as tiles (t, c, lanes), the last one filled up with `rest`."""
         m, columns = values.shape
-        count = -(-len(values) // self._lanes)
-        padded: np.ndarray = np.full((count * self._lanes, columns), rest, dtype)
+        count = -(-len(values) // LANES)
+        padded: np.ndarray = np.full((count * LANES, columns), rest, dtype)
         padded[:m] = values.take(self._order, axis=0)
-        tiles = padded.reshape(count, self._lanes, columns).transpose(0, 2, 1)
+        tiles = padded.reshape(count, LANES, columns).transpose(0, 2, 1)
         return np.ascontiguousarray(tiles)

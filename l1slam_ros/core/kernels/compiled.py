@@ -28,8 +28,6 @@ from typing import Any
 from l1slam_ros.core.kernels.kept import link, objects
 
 Kernel = Callable[..., Any]
-# Of blocks of whole poses in the plane, and of parts of poses; see `cholesky`.
-ANY_SIZE = ('UniTuple(i8, 3)', 'f8[::1]')
 
 
 class Loop:
@@ -122,13 +120,6 @@ def loop(*takes: str, space: tuple[str, ...] = (), brief: bool = False,
          as_written: bool = False) -> Callable[[Kernel], Loop]:
     """Return what makes a function that the interpreter calls a `Loop`."""
     return lambda function: Loop(function, takes, space, brief, as_written)
-
-
-def for_sizes(takes: str, plane: tuple[str, ...] = ('UniTuple(i8, 3)',)) -> Callable[
-        [Kernel], Loop]:
-    """Return `loop` for functions whose last argument is a tuple as long as a block has rows."""
-    return loop(*(f'({takes}, {size})' for size in plane),
-                space=(f'({takes}, UniTuple(i8, 6))',))
 
 
 def make_ready(kernel: Loop, space: bool) -> None:

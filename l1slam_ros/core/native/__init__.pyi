@@ -3,8 +3,10 @@
 from . import blocks as blocks
 from . import border as border
 from . import cholesky as cholesky
+from . import halpern as halpern
 from . import interior_point as interior_point
 from . import ordering as ordering
+from . import prediction as prediction
 from . import scans as scans
 from . import se2 as se2
 from . import se3 as se3

@@ -14,12 +14,30 @@ namespace blocks {
     ((k) == 3 ? function<3>(__VA_ARGS__) : (k) == 6 ? function<6>(__VA_ARGS__) \
                                                     : function<0>(__VA_ARGS__))
 
+// keyframe : (m, 2) which keyframe's step each block multiplies; whatever is none of the n free
+// ones stands for what is held fixed. blocks : (m, 2, k, k).
+using Keyframes = Matrix<const int64_t>;
+using Blocks = Array<const double, 4>;
+
+inline void check(Keyframes keyframe, Blocks blocks) {
+    require(blocks.shape[1] == 2 && blocks.shape[2] == blocks.shape[3],
+            "blocks must be (m, 2, k, k)");
+    require(keyframe.size() == blocks.size() && keyframe.shape[1] == 2,
+            "keyframe must be (m, 2), m as of blocks");
+}
+// Whether k is one of n; by one comparison.
+inline bool is_free(int64_t k, int64_t n) { return uint64_t(k) < uint64_t(n); }
+
 template <int K>
-void multiply_sized(Matrix<int64_t> keyframe, Array<double, 4> blocks, Matrix<double> x,
+void multiply_sized(Keyframes keyframe, Blocks blocks, Matrix<const double> x,
                     Matrix<double> product) {
-    const int64_t k = K ? K : blocks.shape[3];
+    const int64_t k = K ? K : blocks.shape[3], n = x.size();
+    const std::vector<double> fixed(k, 0.0);
     for (int64_t f = 0; f < blocks.size(); f++) {
-        const double *block = blocks[f], *xi = x[keyframe(f, 0)], *xj = x[keyframe(f, 1)];
+        const int64_t i = keyframe(f, 0), j = keyframe(f, 1);
+        const double* xi = is_free(i, n) ? x[i] : fixed.data();
+        const double* xj = is_free(j, n) ? x[j] : fixed.data();
+        const double* block = blocks[f];
         for (int64_t r = 0; r < k; r++) {
             double total = 0.0;
             for (int64_t c = 0; c < k; c++)
@@ -29,20 +47,27 @@ void multiply_sized(Matrix<int64_t> keyframe, Array<double, 4> blocks, Matrix<do
     }
 }
 
-inline void multiply(Matrix<int64_t> keyframe, Array<double, 4> blocks, Matrix<double> x,
-                     Matrix<double> product) {
-    FOR_SIZE(blocks.shape[3], multiply_sized, keyframe, blocks, x, product);
+// A x, (m, k); x : (n, k).
+inline Matrix<double> multiply(Keyframes keyframe, Blocks blocks, Matrix<const double> x) {
+    check(keyframe, blocks);
+    require(x.shape[1] == blocks.shape[3], "x must be (n, k), k as of blocks");
+    auto product = new_array<double, 2>({blocks.size(), x.shape[1]});
+    FOR_SIZE(x.shape[1], multiply_sized, keyframe, blocks, x, product);
+    return product;
 }
 
 template <int K>
-void multiply_transposed_sized(Matrix<int64_t> keyframe, Array<double, 4> blocks,
-                               Matrix<double> y, Matrix<double> product) {
-    const int64_t k = K ? K : blocks.shape[3];
+void multiply_transposed_sized(Keyframes keyframe, Blocks blocks, Matrix<const double> y,
+                               Matrix<double> product) {
+    const int64_t k = K ? K : blocks.shape[3], n = product.size();
+    std::vector<double> fixed(k);
+    std::fill_n(product.data, n * k, 0.0);
     for (int64_t f = 0; f < blocks.size(); f++) {
         const double* own = y[f];
         for (int side = 0; side < 2; side++) {
+            const int64_t v = keyframe(f, side);
             const double* block = blocks[f] + side * k * k;
-            double* to = product[keyframe(f, side)];
+            double* to = is_free(v, n) ? product[v] : fixed.data();
             for (int64_t c = 0; c < k; c++) {
                 double total = 0.0;
                 for (int64_t r = 0; r < k; r++) total += block[r * k + c] * own[r];
@@ -52,14 +77,29 @@ void multiply_transposed_sized(Matrix<int64_t> keyframe, Array<double, 4> blocks
     }
 }
 
-inline void multiply_transposed(Matrix<int64_t> keyframe, Array<double, 4> blocks,
-                                Matrix<double> y, Matrix<double> product) {
-    FOR_SIZE(blocks.shape[3], multiply_transposed_sized, keyframe, blocks, y, product);
+// A'y, (n, k); y : (m, k).
+inline Matrix<double> multiply_transposed(Keyframes keyframe, Blocks blocks,
+                                          Matrix<const double> y, int64_t n) {
+    check(keyframe, blocks);
+    require(y.size() == blocks.size() && y.shape[1] == blocks.shape[3],
+            "y must be (m, k), as of blocks");
+    require(n >= 0, "n must not be negative");
+    auto product = new_array<double, 2>({n, y.shape[1]});
+    FOR_SIZE(y.shape[1], multiply_transposed_sized, keyframe, blocks, y, product);
+    return product;
 }
 
-// L' e of each factor; roots : (m, k, k) L', upper triangular.
+// Square roots of information of each factor, (m, k, k) L', upper triangular.
+using Roots = Array<const double, 3>;
+
+inline void check(Roots roots, int64_t m, int64_t k) {
+    require(roots.size() == m && roots.shape[1] == k && roots.shape[2] == k,
+            "roots must be (m, k, k), as of what they multiply");
+}
+
+// L' e of each factor.
 template <int K>
-void whiten_sized(Array<double, 3> roots, Matrix<double> vectors, Matrix<double> product) {
+void whiten_sized(Roots roots, Matrix<const double> vectors, Matrix<double> product) {
     const int64_t k = K ? K : vectors.shape[1];
     for (int64_t f = 0; f < roots.size(); f++)
         for (int64_t r = 0; r < k; r++) {
@@ -69,14 +109,16 @@ void whiten_sized(Array<double, 3> roots, Matrix<double> vectors, Matrix<double>
         }
 }
 
-inline Matrix<double> whiten(Array<double, 3> roots, Matrix<double> vectors) {
-    auto product = new_array<double, 2>({roots.shape[0], vectors.shape[1]});
+inline Matrix<double> whiten(Roots roots, Matrix<const double> vectors) {
+    check(roots, vectors.size(), vectors.shape[1]);
+    auto product = new_array<double, 2>({vectors.size(), vectors.shape[1]});
     FOR_SIZE(vectors.shape[1], whiten_sized, roots, vectors, product);
     return product;
 }
 
+// L y of each factor.
 template <int K>
-void unwhiten_sized(Array<double, 3> roots, Matrix<double> duals, Matrix<double> product) {
+void unwhiten_sized(Roots roots, Matrix<const double> duals, Matrix<double> product) {
     const int64_t k = K ? K : duals.shape[1];
     for (int64_t f = 0; f < roots.size(); f++)
         for (int64_t r = 0; r < k; r++) {
@@ -86,14 +128,15 @@ void unwhiten_sized(Array<double, 3> roots, Matrix<double> duals, Matrix<double>
         }
 }
 
-inline Matrix<double> unwhiten_dual(Array<double, 3> roots, Matrix<double> duals) {
-    auto product = new_array<double, 2>({roots.shape[0], duals.shape[1]});
+inline Matrix<double> unwhiten_dual(Roots roots, Matrix<const double> duals) {
+    check(roots, duals.size(), duals.shape[1]);
+    auto product = new_array<double, 2>({duals.size(), duals.shape[1]});
     FOR_SIZE(duals.shape[1], unwhiten_sized, roots, duals, product);
     return product;
 }
 
 // Turn J_i and J_j of each factor into L'J_i and L'J_j; a row needs none above it.
-template <int K> void whiten_blocks_sized(Array<double, 3> roots, Array<double, 4> blocks) {
+template <int K> void whiten_blocks_sized(Roots roots, Array<double, 4> blocks) {
     const int64_t k = K ? K : blocks.shape[3];
     for (int64_t f = 0; f < roots.size(); f++)
         for (int side = 0; side < 2; side++) {
@@ -120,7 +163,10 @@ template <int K> void whiten_blocks_sized(Array<double, 3> roots, Array<double, 
         }
 }
 
-inline void whiten_blocks(Array<double, 3> roots, Array<double, 4> blocks) {
+inline void whiten_blocks(Roots roots, Array<double, 4> blocks) {
+    require(blocks.shape[1] == 2 && blocks.shape[2] == blocks.shape[3],
+            "blocks must be (m, 2, k, k)");
+    check(roots, blocks.size(), blocks.shape[3]);
     FOR_SIZE(blocks.shape[3], whiten_blocks_sized, roots, blocks);
 }
 
@@ -170,50 +216,93 @@ INLINE void add_curvature(const double* curvature, double share, double* const o
             at[r * width + c] += share * left_rows[(r - still) * 2 * k + (1 - left) * k + c];
 }
 
+// Where in the panels of `cholesky` the blocks lie. address, width : (m,) the block between the
+// keyframes i and j of each factor, and the stride of its panel; address -1: there is none; turned :
+// (m,) that block is the one of row i and column j; corner, stride : (n,) where each keyframe's own
+// block begins, and its panel's stride.
+struct Places {
+    Vector<const int64_t> address, width;
+    Vector<const bool> turned;
+    Vector<const int64_t> corner, stride;
+
+    void check(int64_t m, int64_t n, int64_t k, int64_t size) const {
+        require(address.size() == m && width.size() == m && turned.size() == m,
+                "address, width and turned must have an entry for each factor");
+        require(corner.size() == n && stride.size() == n,
+                "corner and stride must have an entry for each row of diagonal");
+        bool fits = true;
+        for (int64_t f = 0; f < m; f++)
+            fits &= address[f] < 0 ||
+                    (width[f] >= 0 && address[f] + (k - 1) * width[f] + k <= size);
+        require(fits, "address and width must point into panels");
+        for (int64_t v = 0; v < n; v++)
+            fits &= corner[v] >= 0 && stride[v] >= 0 &&
+                    corner[v] + (k - 1) * stride[v] + k <= size;
+        require(fits, "corner and stride must point into panels");
+    }
+};
+
 template <int K>
-void assemble_sized(Vector<double> panels, Matrix<int64_t> keyframe, Vector<int64_t> address,
-                    Vector<int64_t> width, Vector<bool> turned, Vector<int64_t> corner,
-                    Vector<int64_t> stride, Array<double, 4> blocks, Matrix<double> weights,
-                    Matrix<double> diagonal, Array<double, 4> curvature, double share) {
-    const int64_t k = K ? K : blocks.shape[3], n = corner.size(), m = blocks.size();
+void assemble_sized(Vector<double> panels, Keyframes keyframe, const Places& at, Blocks blocks,
+                    Matrix<const double> weights, Matrix<const double> diagonal,
+                    Array<const double, 4> curvature, double share) {
+    const int64_t k = K ? K : blocks.shape[3], n = diagonal.size(), m = blocks.size();
     std::fill_n(panels.data, panels.size(), 0.0);
-    // Keyframes' own blocks are summed up side by side: in the panels they lie far apart.
+    // Keyframes' own blocks are summed up side by side: in the panels they lie far apart, and each
+    // factor would wait for two of them. The last one is of what is held fixed.
     std::vector<double> own((n + 1) * k * k);
     for (int64_t v = 0; v < n; v++)
         for (int64_t a = 0; a < k; a++) own[(v * k + a) * k + a] = diagonal(v, a);
     constexpr int64_t AHEAD = 16;
     for (int64_t f = 0; f < m; f++) {
-        if (f + AHEAD < m && address[f + AHEAD] >= 0)
+        if (f + AHEAD < m && at.address[f + AHEAD] >= 0)
             for (int64_t r = 0; r < k; r++)
-                __builtin_prefetch(&panels[address[f + AHEAD] + r * width[f + AHEAD]], 1);
-        int left = turned[f] ? 0 : 1;
+                __builtin_prefetch(
+                    &panels[at.address[f + AHEAD] + r * at.width[f + AHEAD]], 1);
+        const int left = at.turned[f] ? 0 : 1;
         const double* block[2] = {blocks[f], blocks[f] + k * k};
-        double* mine[2] = {&own[keyframe(f, 0) * k * k], &own[keyframe(f, 1) * k * k]};
-        for (int side = 0; side < 2; side++)
+        double* mine[2];
+        for (int side = 0; side < 2; side++) {
+            const int64_t v = is_free(keyframe(f, side), n) ? keyframe(f, side) : n;
+            mine[side] = &own[v * k * k];
             add_product<K>(block[side], block[side], weights[f], mine[side], k, k);
-        double* at = address[f] < 0 ? nullptr : &panels[address[f]];
-        if (at) add_product<K>(block[left], block[1 - left], weights[f], at, width[f], k);
+        }
+        double* between = at.address[f] < 0 ? nullptr : &panels[at.address[f]];
+        if (between)
+            add_product<K>(block[left], block[1 - left], weights[f], between, at.width[f], k);
         if (f < curvature.size())
-            add_curvature<K>(curvature[f], share, mine, at, width[f], left, k);
+            add_curvature<K>(curvature[f], share, mine, between, at.width[f], left, k);
     }
     for (int64_t v = 0; v < n; v++)
         for (int64_t r = 0; r < k; r++)
             for (int64_t c = 0; c <= r; c++)
-                panels[corner[v] + r * stride[v] + c] = own[(v * k + r) * k + c];
+                panels[at.corner[v] + r * at.stride[v] + c] = own[(v * k + r) * k + c];
 }
 
-// Write the lower triangle of J'WJ + diag(diagonal) + share C to the panels.
-inline void assemble(Vector<double> panels, Matrix<int64_t> keyframe, Vector<int64_t> address,
-                     Vector<int64_t> width, Vector<bool> turned, Vector<int64_t> corner,
-                     Vector<int64_t> stride, Array<double, 4> blocks, Matrix<double> weights,
-                     Matrix<double> diagonal, Array<double, 4> curvature, double share) {
-    FOR_SIZE(blocks.shape[3], assemble_sized, panels, keyframe, address, width, turned, corner,
-             stride, blocks, weights, diagonal, curvature, share);
+// Write the lower triangle of J'WJ + diag(diagonal) + share C to the panels. weights : (m, k);
+// diagonal : (n, k); curvature : (m', 2, k / 2, 2 k) of the first m' factors, of each the rows of
+// the turns, the last entries, of keyframe i, and of j, which are its columns, too; all else is
+// zero. C is their sum.
+inline void assemble(Vector<double> panels, Keyframes keyframe, Vector<const int64_t> address,
+                     Vector<const int64_t> width, Vector<const bool> turned,
+                     Vector<const int64_t> corner, Vector<const int64_t> stride, Blocks blocks,
+                     Matrix<const double> weights, Matrix<const double> diagonal,
+                     Array<const double, 4> curvature, double share) {
+    check(keyframe, blocks);
+    const int64_t k = blocks.shape[3];
+    require(weights.size() == blocks.size() && weights.shape[1] == k, "weights must be (m, k)");
+    require(diagonal.shape[1] == k, "diagonal must be (n, k)");
+    require(curvature.size() <= blocks.size() && curvature.shape[1] == 2 &&
+            curvature.shape[2] == k / 2 && curvature.shape[3] == 2 * k,
+            "curvature must be (m, 2, k / 2, 2 k) or of fewer factors");
+    const Places at{address, width, turned, corner, stride};
+    at.check(blocks.size(), diagonal.size(), k, panels.size());
+    FOR_SIZE(k, assemble_sized, panels, keyframe, at, blocks, weights, diagonal, curvature, share);
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(multiply, "keyframe, blocks, x, product"),
-    FUNCTION(multiply_transposed, "keyframe, blocks, y, product"),
+    FUNCTION(multiply, "keyframe, blocks, x"),
+    FUNCTION(multiply_transposed, "keyframe, blocks, y, n"),
     FUNCTION(whiten, "roots, vectors"),
     FUNCTION(unwhiten_dual, "roots, duals"),
     FUNCTION(whiten_blocks, "roots, blocks"),

@@ -1,14 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
-// Supernodal Cholesky of a sparse matrix of d x d blocks, left-looking, in register tiles.
-// Panels are dense, row after row: entry (r, c) of panel s is panels[offset[s] + r stride[s] + c].
+// Supernodal Cholesky of a sparse matrix of k x k blocks, which `blocks::assemble` wrote.
+// Left-looking: each supernode gathers what all earlier ones subtract from it, then is factored.
+// All the work is done in tiles of rows and columns: a tile stays in the processor's registers
+// while what its rows have in common with its columns is summed up.
+// Source: Ng and Peyton, "Block sparse Cholesky algorithms on advanced uniprocessor computers"
+// (1993); tiles: Goto and van de Geijn, "Anatomy of high-performance matrix multiplication" (2008).
 #pragma once
 #include <algorithm>
 #include <cmath>
+#include <system_error>
+#include <thread>
 #include <type_traits>
 #include <vector>
 
 #include "arrays.hpp"
 #include "lanes.hpp"
+#include "panels.hpp"
 
 namespace cholesky {
 
@@ -90,6 +97,8 @@ void pack(const double* source, int64_t stride, int rows, int64_t inner, double*
 }
 
 // Subtract products of a source's first rows from the panel that they belong to.
+// place : (height,) where each of the rows begins in the target's panel; target : (columns,) the
+// column of that panel that belongs to each of the first rows; packed : work space.
 inline void subtract(const double* source, int64_t stride, int64_t inner, int64_t height,
                      int64_t columns, double* panels, const int64_t* place, const int64_t* target,
                      double* packed) {
@@ -110,15 +119,18 @@ inline void subtract(const double* source, int64_t stride, int64_t inner, int64_
     }
 }
 
-// Subtract products of blocks in the plane with the first of them.
+// Subtract products of blocks in the plane with the first of them from another panel: a tile would
+// take longer to begin than so few products. begin, width : of the blocks; rows : (count,) their
+// positions; local, column, stride : where to.
 inline void subtract_blocks(double* panels, int64_t begin, int64_t width, const int32_t* rows,
                             int64_t count, const int64_t* local, int64_t column, int64_t stride) {
     const double* source = panels + begin;
     Lanes<4> right[PLANE];
-    for (int q = 0; q < PLANE; q++)
-        for (int r = 0; r < 4; r++)
-            right[q].part[r / Lanes<4>::W][r % Lanes<4>::W] =
-                r < PLANE ? source[width * r + q] : 0.0;
+    for (int q = 0; q < PLANE; q++) {
+        right[q] = Lanes<4>::zero();
+        for (int r = 0; r < PLANE; r++)
+            right[q].part[r / Lanes<4>::W][r % Lanes<4>::W] = source[width * r + q];
+    }
     for (int64_t k = 0; k < count; k++) {
         const double* block = source + width * PLANE * k;
         double* to = panels + local[rows[k]] + column;
@@ -179,6 +191,7 @@ inline int factorise_corner(double* corner, int64_t stride, int width, const dou
 }
 
 // Factor the diagonal block of a panel and solve for the rest; return the bad column.
+// least : (width,) what each pivot must exceed; others : work space.
 inline int64_t factorise_panel(double* panels, int64_t begin, int64_t stride, int64_t height,
                                int64_t width, const double* least, int64_t* place,
                                int64_t* target, double* packed) {
@@ -201,76 +214,141 @@ inline int64_t factorise_panel(double* panels, int64_t begin, int64_t stride, in
     return width;
 }
 
-// Turn the lower triangle in `panels` into its factor, for one share of the supernodes; return
-// the first position whose pivot is not positive, the number of positions when all are.
-inline int64_t factorise(Vector<double> panels_, Vector<int32_t> first, Vector<int64_t> start,
-                         Vector<int32_t> pattern, Vector<int64_t> offset, Vector<int64_t> stride,
-                         Vector<int32_t> owner, Vector<int8_t> share, int64_t mine,
-                         Matrix<int32_t> lists, Vector<int64_t> reach, int64_t d) {
-    double* panels = panels_.data;
-    int64_t count = first.size() - 1, n = first[count], tallest = 0;
-    int32_t *head = lists[0], *next = lists[1];
-    // Let a supernode wait for the one that owns its next row, if that is of this share.
-    auto enqueue = [&](int64_t s) {
-        if (start[s] + reach[s] < start[s + 1]) {
-            int32_t target = owner[pattern[start[s] + reach[s]]];
-            if (share[target] == mine) next[s] = head[target], head[target] = int32_t(s);
+// One factorisation. Supernodes have shares, 0 and 1, which may be worked on at the same time, and
+// 2, which comes after both.
+class Factorisation {
+  public:
+    Factorisation(double* panels, const Panels& shape, Vector<const int8_t> share)
+        : panels(panels), shape(shape), share(share), owner(shape.positions()),
+          head(shape.count(), -1), next(shape.count(), -1), reach(shape.count(), 0) {
+        for (int64_t s = 0; s < shape.count(); s++)
+            for (int32_t k = shape.first[s]; k < shape.first[s + 1]; k++) owner[k] = int32_t(s);
+        const int64_t tallest = shape.tallest() * shape.k;
+        for (Work& own : work) {
+            own.local.resize(shape.positions()), own.place.resize(tallest);
+            own.target.resize(tallest), own.least.resize(tallest);
+            own.packed.resize(WIDE * (tallest + WIDE + 1));
+            if (!has(1)) break;
         }
+    }
+    bool has(int8_t which) const {
+        return std::find(share.data, share.data + share.size(), which) != share.data + share.size();
+    }
+    // Factorise one share; return the first position whose pivot is not positive, the number of
+    // positions when all are.
+    int64_t run(int8_t mine) {
+        for (int64_t s = 0; s < shape.count(); s++)
+            if (share[s] < mine) enqueue(s, mine);
+        for (int64_t s = 0; s < shape.count(); s++) {
+            if (share[s] != mine) continue;
+            const int64_t bad = factorise_supernode(s, mine, work[mine == 1]);
+            if (bad < shape.columns(s) * shape.k) return shape.first[s] + bad / shape.k;
+            reach[s] = shape.columns(s);
+            enqueue(s, mine);
+        }
+        return shape.positions();
+    }
+
+  private:
+    // Of each position where its rows begin in a panel; of rows, of columns; see `subtract`.
+    struct Work {
+        std::vector<int64_t> local, place, target;
+        std::vector<double> least, packed;
     };
-    for (int64_t s = 0; s < count; s++) {
-        tallest = std::max(tallest, start[s + 1] - start[s]);
-        if (share[s] < mine) enqueue(s);
+    double* const panels;
+    const Panels shape;
+    const Vector<const int8_t> share;
+    std::vector<int32_t> owner;
+    // What has something to subtract from supernode s is a linked list: head[s], next[head[s]]
+    // ...; reach : from which of its rows on.
+    std::vector<int32_t> head, next;
+    std::vector<int64_t> reach;
+    Work work[2];
+
+    // Let a supernode wait for the one that owns its next row, if that is of this share.
+    void enqueue(int64_t s, int8_t mine) {
+        if (reach[s] >= shape.rows(s)) return;
+        const int32_t target = owner[shape.pattern[shape.start[s] + reach[s]]];
+        if (share[target] == mine) next[s] = head[target], head[target] = int32_t(s);
     }
-    tallest *= d;
-    std::vector<int64_t> local(n), place(tallest), target(tallest);
-    std::vector<double> least(tallest), packed(WIDE * (tallest + WIDE + 1));
-    for (int64_t s = 0; s < count; s++) {
-        if (share[s] != mine) continue;
-        int64_t begin = offset[s], own = stride[s], width = (first[s + 1] - first[s]) * d;
-        const int32_t* rows = &pattern[start[s]];
-        int64_t height = (start[s + 1] - start[s]) * d;
-        for (int64_t k = 0; k < start[s + 1] - start[s]; k++) local[rows[k]] = begin + k * d * own;
-        for (int64_t c = 0; c < width; c++) least[c] = SINGULAR * panels[begin + c * (own + 1)];
+
+    // Return the column whose pivot is bad, the number of columns when none is.
+    int64_t factorise_supernode(int64_t s, int8_t mine, Work& own) {
+        const int64_t k = shape.k, begin = shape.offset[s], stride = shape.stride[s];
+        const int64_t width = shape.columns(s) * k, height = shape.rows(s) * k;
+        const int32_t* rows = &shape.pattern[shape.start[s]];
+        int64_t* local = own.local.data();
+        double* least = own.least.data();
+        for (int64_t r = 0; r * k < height; r++) local[rows[r]] = begin + r * k * stride;
+        for (int64_t c = 0; c < width; c++) least[c] = SINGULAR * panels[begin + c * (stride + 1)];
         for (int64_t source = head[s]; source >= 0;) {
-            int64_t next_source = next[source], step = stride[source];
-            const int32_t* below = &pattern[start[source] + reach[source]];
-            int64_t many = start[source + 1] - start[source] - reach[source], columns = 0;
-            int64_t inner = (first[source + 1] - first[source]) * d;
-            int64_t top = offset[source] + reach[source] * d * step;
-            while (columns < many && below[columns] < first[s + 1]) columns++;
-            if (d == PLANE && inner <= THIN) {
-                for (int64_t c = 0; c < columns; c++)
-                    for (int64_t q = top; q < top + inner; q += PLANE)
-                        subtract_blocks(panels, q + c * PLANE * step, step, below + c, many - c,
-                                        local.data(), (below[c] - first[s]) * PLANE, own);
-            } else {
-                for (int64_t k = 0; k < many; k++)
-                    for (int64_t a = 0; a < d; a++) place[k * d + a] = local[below[k]] + a * own;
-                for (int64_t k = 0; k < columns; k++)
-                    for (int64_t a = 0; a < d; a++)
-                        target[k * d + a] = (below[k] - first[s]) * d + a;
-                subtract(panels + top, step, inner, many * d, columns * d, panels, place.data(),
-                         target.data(), packed.data());
-            }
-            reach[source] += columns;
-            enqueue(source);
-            source = next_source;
+            const int64_t behind = next[source];
+            reach[source] += subtract_source(source, s, own);
+            enqueue(source, mine);
+            source = behind;
         }
-        int64_t bad = width == PLANE
-            ? factorise_block(panels + begin, own, height, least.data())
-            : factorise_panel(panels, begin, own, height, width, least.data(), place.data(),
-                              target.data(), packed.data());
-        if (bad < width) return first[s] + bad / d;
-        reach[s] = first[s + 1] - first[s];
-        enqueue(s);
+        return width == PLANE
+            ? factorise_block(panels + begin, stride, height, least)
+            : factorise_panel(panels, begin, stride, height, width, least,
+                              own.place.data(), own.target.data(), own.packed.data());
     }
-    return n;
+
+    // Subtract what an earlier supernode has for supernode s; return of how many block columns.
+    int64_t subtract_source(int64_t source, int64_t s, Work& own) {
+        const int64_t k = shape.k, step = shape.stride[source], stride = shape.stride[s];
+        const int64_t first = shape.first[s], end = shape.first[s + 1];
+        const int64_t* local = own.local.data();
+        int64_t *place = own.place.data(), *target = own.target.data();
+        const int32_t* below = &shape.pattern[shape.start[source] + reach[source]];
+        const int64_t many = shape.rows(source) - reach[source];
+        const int64_t inner = shape.columns(source) * k;
+        const int64_t top = shape.offset[source] + reach[source] * k * step;
+        int64_t columns = 0;
+        while (columns < many && below[columns] < end) columns++;
+        if (k == PLANE && inner <= THIN) {
+            for (int64_t c = 0; c < columns; c++)
+                for (int64_t q = top; q < top + inner; q += PLANE)
+                    subtract_blocks(panels, q + c * PLANE * step, step, below + c, many - c, local,
+                                    (below[c] - first) * PLANE, stride);
+            return columns;
+        }
+        for (int64_t r = 0; r < many; r++)
+            for (int64_t a = 0; a < k; a++)
+                place[r * k + a] = local[below[r]] + a * stride;
+        for (int64_t c = 0; c < columns; c++)
+            for (int64_t a = 0; a < k; a++)
+                target[c * k + a] = (below[c] - first) * k + a;
+        subtract(panels + top, step, inner, many * k, columns * k, panels, place, target,
+                 own.packed.data());
+        return columns;
+    }
+};
+
+// Turn the lower triangle in `panels` into its factor; return the first position whose pivot is
+// not positive, the number of positions when all are. k : rows of a block; share : of each
+// supernode, see `Factorisation`; threads : how many may be used.
+inline int64_t factorise(Vector<double> panels, PANELS_ARGUMENTS, Vector<const int8_t> share,
+                         int64_t k, int64_t threads) {
+    const Panels shape(panels.size(), first, start, pattern, offset, stride, k);
+    require(share.size() == shape.count(), "share must have an entry for each panel");
+    Factorisation all(panels.data, shape, share);
+    if (!all.has(1)) return std::min(all.run(0), all.run(2));
+    int64_t one = 0, other = 0;
+    std::thread second;
+    if (threads > 1) {
+        try {
+            second = std::thread([&] { other = all.run(1); });
+        } catch (const std::system_error&) {  // there are no more threads to be had
+        }
+    }
+    one = all.run(0);
+    if (second.joinable()) second.join();
+    else other = all.run(1);
+    return std::min({one, other, all.run(2)});
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(factorise,
-             "panels, first, start, pattern, offset, stride, owner, share, mine, lists, "
-             "reach, d"),
+    FUNCTION(factorise, "panels, " PANELS_NAMES ", share, k, threads"),
     {}};
 
 }  // namespace cholesky

@@ -17,6 +17,8 @@ constexpr int WIDTH = 2;
 #define INLINE inline __attribute__((always_inline))
 // Else what a short loop goes through is in memory, and not in registers.
 #define UNROLL _Pragma("GCC unroll 16")
+// Arrays do not overlap, which the compiler is told: else it takes one entry after the other.
+#define NO_OVERLAP _Pragma("GCC ivdep")
 
 // GCC takes these only with sizes that depend on no template.
 template <int W> struct RegisterOf;

@@ -4,8 +4,10 @@
 #include "blocks.hpp"
 #include "border.hpp"
 #include "cholesky.hpp"
+#include "halpern.hpp"
 #include "interior_point.hpp"
 #include "ordering.hpp"
+#include "prediction.hpp"
 #include "scans.hpp"
 #include "se2.hpp"
 #include "se3.hpp"
@@ -22,8 +24,10 @@ const Part parts[] = {
     {"blocks", blocks::methods},
     {"border", border::methods},
     {"cholesky", cholesky::methods},
+    {"halpern", halpern::methods},
     {"interior_point", interior_point::methods},
     {"ordering", ordering::methods},
+    {"prediction", prediction::methods},
     {"scans", scans::methods},
     {"se2", se2::methods},
     {"se3", se3::methods},

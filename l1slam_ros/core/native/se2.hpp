@@ -8,6 +8,15 @@
 
 namespace se2 {
 
+// Poses (x, y, theta), (n, 3), or other three numbers of each factor.
+using Poses = Matrix<const double>;
+
+inline void check(Poses z, Poses x_i, Poses x_j) {
+    require(z.shape[1] == 3, "z must be (n, 3)");
+    require(x_i.shape[0] == z.size() && x_i.shape[1] == 3, "x_i must be (n, 3), like z");
+    require(x_j.shape[0] == z.size() && x_j.shape[1] == 3, "x_j must be (n, 3), like z");
+}
+
 constexpr double PI = 3.14159265358979323846;
 // Polynomials of sine and cosine from -pi/4 to pi/4. Source: fdlibm, k_sin.c, k_cos.c.
 constexpr double SINE[] = {-1.66666666666666324348e-01, 8.33333333332248946124e-03,
@@ -17,11 +26,13 @@ constexpr double COSINE[] = {4.16666666666666019037e-02, -1.38888888888741095749
                              2.48015872894767294178e-05, -2.75573143513906633035e-07,
                              2.08757232129817482790e-09, -1.13596475577881948265e-11};
 
-// Cosines and sines of the angles of poses: all at once, so that it is done by vectors.
+// Cosines and sines of the angles of poses: all at once, so that it is done by vectors. As exact
+// as for an angle that differs by the rounding of this one. NaN and infinity become NaN; an angle
+// so large that its rounding is a turn becomes some other angle.
 struct Turns {
     std::unique_ptr<double[]> c, s;
 
-    explicit Turns(Matrix<double> poses)
+    explicit Turns(Poses poses)
         : c(new double[poses.size()]), s(new double[poses.size()]) {
         double *to_c = c.get(), *to_s = s.get();
         const double* from = poses.data + 2;
@@ -47,18 +58,21 @@ struct Turns {
     }
 };
 
+// An angle [rad] in (-pi, pi].
 inline double wrapped(double angle) {
     angle -= 2 * PI * std::rint(angle / (2 * PI));
     return angle <= -PI || angle > PI ? PI : angle;  // NaN stays
 }
 
+// The position of j seen from i, Ri'(tj - ti); c, s : cosine and sine of i's angle.
 struct Seen {
     double x, y;
     Seen(const double* i, const double* j, double c, double s)
         : x(c * (j[0] - i[0]) + s * (j[1] - i[1])), y(c * (j[1] - i[1]) - s * (j[0] - i[0])) {}
 };
 
-inline Matrix<double> residual(Matrix<double> z, Matrix<double> x_i, Matrix<double> x_j) {
+inline Matrix<double> residual(Poses z, Poses x_i, Poses x_j) {
+    check(z, x_i, x_j);
     auto e = new_array<double, 2>({z.shape[0], 3});
     Turns of_z(z), of_i(x_i);
     for (int64_t f = 0; f < z.size(); f++) {
@@ -72,7 +86,8 @@ inline Matrix<double> residual(Matrix<double> z, Matrix<double> x_i, Matrix<doub
     return e;
 }
 
-inline Array<double, 4> jacobians(Matrix<double> z, Matrix<double> x_i, Matrix<double> x_j) {
+inline Array<double, 4> jacobians(Poses z, Poses x_i, Poses x_j) {
+    check(z, x_i, x_j);
     auto J = new_array<double, 4>({z.shape[0], 2, 3, 3});
     Turns of_z(z), of_i(x_i), of_j(x_j);
     for (int64_t f = 0; f < z.size(); f++) {
@@ -91,8 +106,9 @@ inline Array<double, 4> jacobians(Matrix<double> z, Matrix<double> x_i, Matrix<d
     return J;
 }
 
-inline Array<double, 4> curvature(Matrix<double> z, Matrix<double> x_i, Matrix<double> x_j,
-                                  Matrix<double> dual) {
+inline Array<double, 4> curvature(Poses z, Poses x_i, Poses x_j, Poses dual) {
+    check(z, x_i, x_j);
+    require(dual.size() == z.size() && dual.shape[1] == 3, "dual must be (n, 3), like z");
     auto H = new_array<double, 4>({z.shape[0], 2, 1, 6});
     Turns of_z(z), of_i(x_i), of_j(x_j);
     for (int64_t f = 0; f < z.size(); f++) {

@@ -7,6 +7,15 @@
 
 namespace se3 {
 
+// Poses (x, y, z, qx, qy, qz, qw), (n, 7).
+using Poses = Matrix<const double>;
+
+inline void check(Poses z, Poses x_i, Poses x_j) {
+    require(z.shape[1] == 7, "z must be (n, 7)");
+    require(x_i.shape[0] == z.size() && x_i.shape[1] == 7, "x_i must be (n, 7), like z");
+    require(x_j.shape[0] == z.size() && x_j.shape[1] == 7, "x_j must be (n, 7), like z");
+}
+
 struct Point { double x, y, z; };
 struct Quaternion { double x, y, z, w; };
 
@@ -52,7 +61,8 @@ struct Seen {
     }
 };
 
-inline Matrix<double> residual(Matrix<double> z, Matrix<double> x_i, Matrix<double> x_j) {
+inline Matrix<double> residual(Poses z, Poses x_i, Poses x_j) {
+    check(z, x_i, x_j);
     auto e = new_array<double, 2>({z.shape[0], 6});
     for (int64_t f = 0; f < z.size(); f++) {
         const double* m = z[f];
@@ -64,7 +74,8 @@ inline Matrix<double> residual(Matrix<double> z, Matrix<double> x_i, Matrix<doub
     return e;
 }
 
-inline Array<double, 4> jacobians(Matrix<double> z, Matrix<double> x_i, Matrix<double> x_j) {
+inline Array<double, 4> jacobians(Poses z, Poses x_i, Poses x_j) {
+    check(z, x_i, x_j);
     auto J = new_array<double, 4>({z.shape[0], 2, 6, 6});
     for (int64_t f = 0; f < z.size(); f++) {
         Seen at(z[f], x_i[f], x_j[f]);
@@ -89,13 +100,16 @@ inline Array<double, 4> jacobians(Matrix<double> z, Matrix<double> x_i, Matrix<d
     return J;
 }
 
-inline Array<double, 4> curvature(Matrix<double> z, Matrix<double> x_i, Matrix<double> x_j,
-                                  Matrix<double> dual) {
+inline Array<double, 4> curvature(Poses z, Poses x_i, Poses x_j,
+                                  Matrix<const double> dual) {
+    check(z, x_i, x_j);
+    require(dual.size() == z.size() && dual.shape[1] == 6, "dual must be (n, 6), n as of z");
     auto H = new_array<double, 4>({z.shape[0], 2, 3, 12});
     for (int64_t f = 0; f < z.size(); f++) {
         Seen at(z[f], x_i[f], x_j[f]);
         const double *y = dual[f] + 3, p[3] = {at.p.x, at.p.y, at.p.z};
         Quaternion q = at.q;
+        // R(-q)' turns forwards.
         Point mp = turned_back({-z(f, 3), -z(f, 4), -z(f, 5), z(f, 6)},
                                {dual(f, 0), dual(f, 1), dual(f, 2)});
         const double m[3] = {mp.x, mp.y, mp.z};

@@ -1,10 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 // Solving with the factor that `cholesky` left in the panels, forwards and backwards.
+// Rows of a panel are taken three at a time, so that what is read of the solution serves all
+// three. Most panels of a sparse graph are one keyframe wide: those are taken block by block, by
+// loops whose bounds are known when they are compiled.
 #pragma once
 #include <vector>
 
 #include "arrays.hpp"
 #include "lanes.hpp"
+#include "panels.hpp"
 
 namespace substitution {
 
@@ -16,7 +20,7 @@ template <int K> constexpr int LANES = K == 3 ? 4 : 8;
 template <int K>
 INLINE void forward_block(const double* panel, int64_t stride, const int32_t* rows, int64_t count,
                           double* x) {
-    double own[K], *to = x + rows[0] * K;
+    double own[K], *to = x + int64_t(rows[0]) * K;
     for (int r = 0; r < K; r++) {
         double value = to[r];
         for (int c = 0; c < r; c++) value -= panel[stride * r + c] * own[c];
@@ -91,56 +95,55 @@ inline void backward(const double* panel, int64_t stride, int64_t width, const i
     }
 }
 
-// K : rows of a block, 0: any number of them, k.
+// K : rows of a block, 0: any number of them. x : in the order of elimination.
 template <int K>
-void solve_sized(const double* panels, Vector<int32_t> first, Vector<int64_t> start,
-                 Vector<int32_t> pattern, Vector<int64_t> offset, Vector<int64_t> stride,
-                 std::vector<double>& x, int64_t k) {
-    int64_t count = first.size() - 1, tallest = 0;
-    for (int64_t s = 0; s < count; s++) tallest = std::max(tallest, start[s + 1] - start[s]);
-    std::vector<int64_t> place(tallest * k);
-    auto panel = [&](int64_t s, bool backwards) {
-        int64_t width = first[s + 1] - first[s], rows = start[s + 1] - start[s];
-        const double* from = panels + offset[s];
-        const int32_t* row = &pattern[start[s]];
+void solve_sized(const double* panels, const Panels& shape, double* x) {
+    const int64_t k = K ? K : shape.k;
+    std::vector<int64_t> place(shape.tallest() * k);
+    auto take = [&](int64_t s, bool backwards) {
+        const int64_t width = shape.columns(s), rows = shape.rows(s), stride = shape.stride[s];
+        const double* panel = panels + shape.offset[s];
+        const int32_t* row = &shape.pattern[shape.start[s]];
         if constexpr (K > 0)
             if (width <= THIN) {
                 for (int64_t at = 0; at < width; at++) {
-                    int64_t c = backwards ? width - 1 - at : at;
+                    const int64_t c = backwards ? width - 1 - at : at;
                     auto step = backwards ? backward_block<K> : forward_block<K>;
-                    step(from + c * K * (stride[s] + 1), stride[s], row + c, rows - c, x.data());
+                    step(panel + c * K * (stride + 1), stride, row + c, rows - c, x);
                 }
                 return;
             }
         for (int64_t r = 0; r < rows; r++)
             for (int64_t a = 0; a < k; a++) place[r * k + a] = row[r] * k + a;
-        double* own = &x[first[s] * k];
-        (backwards ? backward(from, stride[s], width * k, place.data(), rows * k, own, x.data())
-                   : forward(from, stride[s], width * k, place.data(), rows * k, own, x.data()));
+        double* own = x + shape.first[s] * k;
+        if (backwards) backward(panel, stride, width * k, place.data(), rows * k, own, x);
+        else forward(panel, stride, width * k, place.data(), rows * k, own, x);
     };
-    for (int64_t s = 0; s < count; s++) panel(s, false);
-    for (int64_t s = count - 1; s >= 0; s--) panel(s, true);
+    for (int64_t s = 0; s < shape.count(); s++) take(s, false);
+    for (int64_t s = shape.count() - 1; s >= 0; s--) take(s, true);
 }
 
-// Return the solution of L L' x = right; both (n, k) in the order of the keyframes.
-inline Matrix<double> solve(Vector<double> panels, Vector<int32_t> first, Vector<int64_t> start,
-                            Vector<int32_t> pattern, Vector<int64_t> offset,
-                            Vector<int64_t> stride, Vector<int32_t> position,
-                            Matrix<double> right) {
-    int64_t n = right.shape[0], k = right.shape[1];
+// The solution of L L' x = right; both (n, k) in the order of the keyframes; position : (n,) of
+// each keyframe in the order of elimination.
+inline Matrix<double> solve(Vector<const double> panels, PANELS_ARGUMENTS,
+                            Vector<const int32_t> position, Matrix<const double> right) {
+    const int64_t n = right.shape[0], k = right.shape[1];
+    const Panels shape(panels.size(), first, start, pattern, offset, stride, k);
+    check_positions(shape, position);
+    require(n == position.size(), "right must have a row for each position");
     auto solution = new_array<double, 2>({n, k});
     std::vector<double> x(n * k);
     for (int64_t f = 0; f < n; f++)
         for (int64_t a = 0; a < k; a++) x[position[f] * k + a] = right(f, a);
     auto solve = k == 3 ? solve_sized<3> : k == 6 ? solve_sized<6> : solve_sized<0>;
-    solve(panels.data, first, start, pattern, offset, stride, x, k);
+    solve(panels.data, shape, x.data());
     for (int64_t f = 0; f < n; f++)
         for (int64_t a = 0; a < k; a++) solution(f, a) = x[position[f] * k + a];
     return solution;
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(solve, "panels, first, start, pattern, offset, stride, position, right"),
+    FUNCTION(solve, "panels, " PANELS_NAMES ", position, right"),
     {}};
 
 }  // namespace substitution

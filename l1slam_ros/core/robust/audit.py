@@ -32,13 +32,18 @@ from math import lgamma
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.robust.confidence import UNLIKELY, Alternative, Drawn, Shifts, drawn
 from l1slam_ros.core.robust.gating import DOUBT, TINY, probability
-from l1slam_ros.core.robust.innovation import TAIL, claimed_volume, log_likelihood_ratio
+from l1slam_ros.core.robust.innovation import (
+    SAMPLES,
+    TAIL,
+    claimed_volume,
+    log_likelihood_ratio,
+)
 from l1slam_ros.core.robust.judgement import OTHER_MAP, UNCONFIRMED
 from l1slam_ros.core.robust.rounds.evidence import Evidence
 from l1slam_ros.core.robust.rounds.growth import Growth
@@ -190,11 +195,11 @@ def _accepted(growth: Growth, rows: Indices, of: Indices, n: int, carried: Array
 def _refused(growth: Growth, rows: Indices, of: Indices, n: int, carried: Array
              ) -> tuple[Array, Array, Array]:
     # C = I + Y Y' by samples, of all loops of a place jointly.
-    system, q = growth.innovations(rows).system, kernels.prediction.SAMPLES
+    system = growth.innovations(rows).system
     k = system.block_size
     B, r = system.blocks[:, 1] @ carried, system.b.reshape(-1, k)
-    Y = kernels.prediction.moved(system.keyframe, system.blocks, growth.posterior.samples)
-    Y = Y / np.sqrt(q)
+    Y = native.prediction.moved(system.keyframe, system.blocks, growth.posterior.samples)
+    Y = Y / np.sqrt(SAMPLES)
     M, b, inner = np.zeros((n, k, k)), np.zeros((n, k)), np.zeros(n)
     single = np.bincount(of, minlength=n)[of] == 1
     at, Bt, own = of[single], B[single].transpose(0, 2, 1), r[single, :, None]
@@ -210,7 +215,7 @@ def _refused(growth: Growth, rows: Indices, of: Indices, n: int, carried: Array
     Bt, Yt = B.transpose(0, 2, 1), Y.transpose(0, 2, 1)
     BB, BY, YY = (_add(of, len(several), product) for product in (Bt @ B, Bt @ Y, Yt @ Y))
     Br, Yr = (_add(of, len(several), (side @ r[:, :, None])[:, :, 0]) for side in (Bt, Yt))
-    W = np.linalg.inv(np.eye(q) + YY)
+    W = np.linalg.inv(np.eye(SAMPLES) + YY)
     WY = (W @ Yr[:, :, None])[:, :, 0]
     M[several] = BB - BY @ W @ BY.transpose(0, 2, 1)
     b[several] = Br - (BY @ WY[:, :, None])[:, :, 0]

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.alignment import align
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask
@@ -172,8 +172,8 @@ class Shifts:
         k = system.block_size
         whole = [self._cholesky.solve(system.transposed_times(e)) for e in np.eye(k)]
         S = np.stack([system.times(x) for x in whole], axis=1) + np.eye(k)
-        moved = kernels.prediction.moved(system.keyframe, system.blocks,
-                                         growth.posterior.samples)[0]
+        moved = native.prediction.moved(system.keyframe, system.blocks,
+                                        growth.posterior.samples)[0]
         noise = np.where(np.arange(moved.size).reshape(moved.shape) % 2, 1.0, -1.0)
         b = np.concatenate((system.b[:, None], noise - moved), axis=1)
         return self._moved([self._some(x) for x in whole], np.linalg.solve(S, b))

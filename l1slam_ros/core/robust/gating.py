@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.robust.innovation import (
@@ -194,7 +194,7 @@ def noise_variance(found: Innovations) -> Array:
     spread = found.spread[best]
     fits: list[tuple[float, float, float]] = []
     for ratio in _RATIOS:
-        square, log_det = kernels.prediction.normalise(spread + ratio * np.eye(k), residual)
+        square, log_det = native.prediction.normalise(spread + ratio * np.eye(k), residual)
         log_det -= (k - freedom) * np.log(ratio)  # uninformative rows have no noise
         for start in (1.0, *(np.quantile(square, (0.1, 0.5)) / k).tolist()):
             likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, k, start)

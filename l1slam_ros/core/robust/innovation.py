@@ -23,7 +23,7 @@ from math import lgamma
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask, filled
@@ -34,6 +34,9 @@ from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, linearise
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 _beta_quantile, _gamma_quantile = cache(beta_quantile), cache(gamma_quantile)
+# Number of posterior samples: standard deviations are right to 10% (1 / sqrt(2 q)), and a pair of
+# factors has far fewer rows. `native.prediction` has the same.
+SAMPLES = 48
 # Noise follows Student's distribution with this number of degrees of freedom for each component of
 # a step: its covariance is not known better. Half makes 5 of 89 runs worse, double 2.
 TAIL = 8
@@ -78,7 +81,7 @@ class Posterior:
     def left_over(self, rows: Indices) -> Array:
         """Return samples of the residuals of some factors, (l, k, q)."""
         system = self.system
-        return self.noise[rows] - kernels.prediction.moved(
+        return self.noise[rows] - native.prediction.moved(
             system.keyframe[rows], system.blocks[rows], self.samples)
 
     def left_out(self) -> Array:
@@ -89,7 +92,7 @@ class Posterior:
         others and R^-1 its covariance, so the square is r'R^-1 r; 0 where others hardly check it.
         """
         moment = filled(self.moment, ~self.speaks).copy()
-        square: Array = kernels.prediction.normalise(moment, self.residual)[0]
+        square: Array = native.prediction.normalise(moment, self.residual)[0]
         alone = np.trace(self.moment, axis1=1, axis2=2) < CHECKED
         return np.where(alone | ~np.isfinite(square), 0.0, square)
 
@@ -111,7 +114,7 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     step = cholesky.solve(system.transposed_times(system.b))
     system = replace(system, b=system.b - system.times(step))
     noise, samples = _steps(graph, system, cholesky)
-    moment = kernels.prediction.left_over(system.keyframe, system.blocks, samples, noise)
+    moment = native.prediction.left_over(system.keyframe, system.blocks, samples, noise)
     return Posterior(system, noise, samples, moment, graph.between.speaks, anchor(graph))
 
 
@@ -147,11 +150,10 @@ def _steps(graph: FactorGraph, system: LinearSystem,
     """Return signs (m, k, q), and the steps (free keyframes + 1, k, q) that they cause."""
     # Signs have the covariance of white noise and are quicker to draw.
     k = system.block_size
-    q = kernels.prediction.SAMPLES
-    noise = signs(keys(graph.between.i, graph.between.j), k, q)
+    noise = signs(keys(graph.between.i, graph.between.j), k, SAMPLES)
     noise[~graph.between.speaks] = 0
-    samples = np.zeros((system.size + 1, k, q))
-    kernels.prediction.gather(system.keyframe, system.blocks, noise, samples)
+    samples = np.zeros((system.size + 1, k, SAMPLES))
+    native.prediction.gather(system.keyframe, system.blocks, noise, samples)
     samples[-1] = 0.0
     cholesky.solve_many(samples[:-1])
     return noise, samples
@@ -218,14 +220,14 @@ class Innovations:
         used[first] = used[second] = True
         rows = np.flatnonzero(used)
         place = np.cumsum(used) - 1
-        moved = kernels.prediction.moved(system.keyframe[rows], system.blocks[rows],
+        moved = native.prediction.moved(system.keyframe[rows], system.blocks[rows],
                                          posterior.samples)
         # All products at once: each factor is in many pairs.
-        columns = moved.reshape(len(rows) * k, -1) / np.sqrt(kernels.prediction.SAMPLES)
+        columns = moved.reshape(len(rows) * k, -1) / np.sqrt(SAMPLES)
         shared = columns @ columns.T
         at = np.arange(len(rows))
         own = shared.reshape(len(rows), k, len(rows), k)[at, :, at] + np.eye(k)
-        square, log_det = kernels.prediction.normalise_pairs(
+        square, log_det = native.prediction.normalise_pairs(
             own, -system.b.reshape(-1, k)[rows], shared, place[first], place[second])
         claim = self.log_claim[first] + self.log_claim[second]
         freedom = self.freedom[first] + self.freedom[second]
@@ -238,11 +240,11 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
     system = linearise(graph, poses, fixed=posterior.fixed)
     factors = graph.between
     k = system.block_size
-    spread = kernels.prediction.left_over(system.keyframe, system.blocks, posterior.samples,
-                                          posterior.noise[:0])
+    spread = native.prediction.left_over(system.keyframe, system.blocks, posterior.samples,
+                                         posterior.noise[:0])
     absolute = np.flatnonzero(factors.is_absolute)
     spread[absolute] += _sagittas(graph.subset(absolute), posterior)
-    square, log_det = kernels.prediction.normalise(spread + np.eye(k), -system.b.reshape(-1, k))
+    square, log_det = native.prediction.normalise(spread + np.eye(k), -system.b.reshape(-1, k))
     return Innovations(system, spread, square, log_det, log_claims(factors, log_volume),
                        factors.freedom)
 

@@ -16,7 +16,7 @@ a gap, both sides are right in themselves: inliers across fail the gate, but all
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.draws import keys
@@ -223,7 +223,7 @@ def agreement(growth: Growth, rows: Indices, high: Indices | None = None
     k = manifold.TANGENT_SIZE
     roots = factors.sqrt_information[b]
     covariance = 2 * np.eye(k) + _spread(growth, (first, second, Z), a, b, roots)
-    square, log_det = kernels.prediction.normalise(covariance, whiten(roots, error))
+    square, log_det = native.prediction.normalise(covariance, whiten(roots, error))
     volume = claimed_volume(manifold, poses)
     freedom = factors.freedom[b]
     log_ratio = log_likelihood_ratio(square, log_det, log_claims(factors, volume)[b], freedom,
@@ -264,4 +264,4 @@ def _spread(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) ->
     blocks = np.stack((roots @ J[0], -roots @ J[1], -roots @ J[2], roots), axis=1)
     keyframe = np.stack((low[a], low[b], high[a], high[b]), axis=1) - growth.posterior.fixed
     keyframe[keyframe < 0] = len(samples) - 1
-    return kernels.prediction.left_over(keyframe, blocks, samples, noise[:0])
+    return native.prediction.left_over(keyframe, blocks, samples, noise[:0])

@@ -14,16 +14,13 @@ the pattern are found once (`Pattern`), for blocks of rotations, of translations
 """
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from threading import Thread
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from l1slam_ros.core import kernels, memory
+from l1slam_ros.core import kernels, memory, native
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -33,10 +30,8 @@ from l1slam_ros.core.graph.linear_system import (
     keyframes_of,
     loose_keyframes,
     neighbours,
-    size_of_blocks,
 )
 
-Result = TypeVar('Result')
 Places = NDArray[np.int32]
 Columns = tuple[Places, Indices, Places]
 _NONE = np.zeros(0, np.int64)
@@ -229,26 +224,18 @@ class BlockCholesky:
         if len(self._loose):
             own = system.diagonal(weights).reshape(-1, k)[self._loose]
             added[self._loose] += np.where(own > 0, _LOOSE * own, 1.0)
-        kernels.blocks.assemble(layout.panels, self._keyframe, *layout.places, system.blocks,
-                                weights.reshape(-1, k), added, curvature, share, layout.size)
+        native.blocks.assemble(layout.panels, self._keyframe, *layout.places, system.blocks,
+                               weights.reshape(-1, k), added, curvature, share)
         self._factored = layout
         return self._factorise(layout) == system.size
 
     def _factorise(self, layout: '_Layout') -> int:
         """Return how many positions have a positive pivot before the first that has not."""
         pattern = self.pattern
-        shared = self.pattern.work * len(layout.size) ** 3 > _SHARED
-        count = len(pattern.first) - 1
-        shares = pattern.halves if shared else np.zeros(count, np.int8)
-        lists = np.full((2, count), -1, np.int32)
-        reach = np.zeros(count, np.int64)
-
-        def share(mine: int) -> int:
-            return kernels.cholesky.factorise(
-                layout.panels, *layout.shape, pattern.owner, shares, mine, lists, reach,
-                len(layout.size))
-
-        return min(*_at_once(share), share(2)) if shared else share(0)
+        shared = pattern.work * layout.block_size**3 > _SHARED
+        share = pattern.halves if shared else np.zeros(len(pattern.first) - 1, np.int8)
+        return native.cholesky.factorise(
+            layout.panels, *layout.shape, share, layout.block_size, _cores() if shared else 1)
 
     @property
     def _last(self) -> '_Layout':
@@ -258,19 +245,18 @@ class BlockCholesky:
     def solve(self, right: Array) -> Array:
         """Return the solution for a right hand side (columns,) by the last factorisation."""
         layout = self._last
-        x: Array = kernels.substitution.solve(layout.panels, *layout.shape, self.pattern.position,
-                                              right.reshape(-1, len(layout.size)))
-        return x.ravel()
+        return native.substitution.solve(layout.panels, *layout.shape, self.pattern.position,
+                                         right.reshape(-1, layout.block_size)).ravel()
 
     def solve_many(self, right: Array) -> None:
         """Turn q right hand sides (free keyframes, k, q) into their solutions, in place."""
         layout = self._last
-        kernels.prediction.solve_many(layout.panels, *layout.shape, self.pattern.position, right)
+        native.prediction.solve_many(layout.panels, *layout.shape, self.pattern.position, right)
 
     def log_det(self) -> float:
         """Return the ln of the determinant of the matrix that was factored last."""
         *_, corner, stride = self._last.places
-        pivots = corner[:, None] + np.arange(len(self._last.size)) * (stride[:, None] + 1)
+        pivots = corner[:, None] + np.arange(self._last.block_size) * (stride[:, None] + 1)
         return 2 * float(np.log(self._last.panels[pivots]).sum())
 
     def covariances(self, at: Indices, parent: Indices, turn: Array, kept: Array,
@@ -289,17 +275,10 @@ class BlockCholesky:
         return product, columns
 
 
-def _at_once(share: Callable[[int], Result]) -> tuple[Result, Result]:
-    """Return share(0) and share(1), at the same time where there is more than one core."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
-    if cores == 1:
-        return share(0), share(1)
-    found: list[Result] = []
-    thread = Thread(target=lambda: found.append(share(1)))
-    thread.start()
-    first = share(0)
-    thread.join()
-    return first, found[0]
+def _cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
+        os.cpu_count() or 1)
 
 
 class _Layout:
@@ -307,12 +286,11 @@ class _Layout:
     Where in memory the blocks of one size lie.
 
     panels : all entries; shape : what describes the panels to the kernels; places : where in them
-    the blocks of factors and keyframes are, see `kernels.symbolic.block_addresses`; size : see
-    `kernels.blocks`.
+    the blocks of factors and keyframes are, see `kernels.symbolic.block_addresses`.
     """
 
     def __init__(self, pattern: Pattern, keyframe: Indices, block_size: int):
-        self.size = size_of_blocks(block_size)
+        self.block_size = block_size
         width = np.diff(pattern.first).astype(np.int64) * block_size
         stride = np.where(width < _WIDE, width, _whole_lines(width))
         areas = _whole_lines(stride * np.diff(pattern.start) * block_size)
@@ -321,8 +299,11 @@ class _Layout:
         begin = -memory.ctypes.data // memory.itemsize % _LINE
         self.panels = memory[begin:begin + offset[-1]]
         self.shape = (pattern.first, pattern.start, pattern.rows, offset, stride)
-        self.places = kernels.symbolic.block_addresses(
+        self.places: _Places = kernels.symbolic.block_addresses(
             keyframe, pattern.position, *self.shape, block_size)
+
+
+_Places = tuple[Indices, Indices, NDArray[np.bool_], Indices, Indices]
 
 
 def _whole_lines(numbers: Indices) -> Indices:

@@ -36,7 +36,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.l1_problem import L1Problem
 from l1slam_ros.core.graph.linear_system import LinearSystem
@@ -73,6 +73,8 @@ _RECOVERY = 1.3
 _ROUNDING, _MORE = 1e-12, 100.0
 # What the complementarity products u s and v t shall become, (rows,) each.
 _Products = tuple[Array, Array]
+# u, v, s, t, Q, e, y of `native.interior_point`, (rows,) each.
+_State = tuple[Array, Array, Array, Array, Array, Array, Array]
 
 
 @dataclass
@@ -103,7 +105,7 @@ class _Iterate:
 
     def advance(self, direction: '_Direction', primal: float) -> None:
         """Go along a direction, u and v so far; the slacks stay positive."""
-        kernels.interior_point.advance(
+        native.interior_point.advance(
             *self.bounded, self.y, *direction.products, direction.y, primal, direction.dual,
             _SMALLEST_SLACK)
 
@@ -192,7 +194,7 @@ def interior_point(
     worst = 1 + tolerance
     for iteration in range(iterations + 1):
         cost = l1_cost(at.residual)
-        gap, apart = kernels.interior_point.missing(*at.bounded, at.residual)
+        gap, apart = native.interior_point.missing(*at.bounded, at.residual)
         small = tolerance * cost
         if (gap <= small and apart <= small) or fits_exactly(cost, len(at.y)):
             status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
@@ -214,7 +216,7 @@ def _start(problem: L1Problem, poses: Array) -> _Iterate:
     """Return the point of the central path of mu = mean |e| for the residual as it is."""
     e = problem.residual(poses)
     system = problem.linearise(poses, e)
-    return _Iterate(poses, system, *kernels.interior_point.begin(e, smoothing(e)))
+    return _Iterate(poses, system, *native.interior_point.begin(e, smoothing(e)))
 
 
 def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: Curvature) -> bool:
@@ -224,7 +226,7 @@ def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: 
     They have the names that Clarabel and others give them: the affine step aims at mu = 0, and how
     far it comes says how far the combined step aims.
     """
-    Q, gap = kernels.interior_point.weigh(*at.bounded)
+    Q, gap = native.interior_point.weigh(*at.bounded)
     if not curvature.factorise(at.system, Q, problem.curvature(at.poses, at.y), cholesky):
         return False
     combined = _direction(at, cholesky, Q, gap)
@@ -244,12 +246,12 @@ def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, gap: float) -> _
     mu = mean * (affine.gap / gap) ** 3
     # Mehrotra's corrector.
     most = mean if len(at.y) > _MANY_ROWS else np.inf
-    c1, c2, pull = kernels.interior_point.aim_combined(*state, affine.y, mu, most)
+    c1, c2, pull = native.interior_point.aim_combined(*state, affine.y, mu, most)
     combined = _solve_kkt(state, at, cholesky, (c1, c2), pull)
     # Else nothing is to be won, or bends hold a step back rather than bounds.
     if combined.reach < _FAR and not at.is_torn:
         # Gondzio's.
-        c1, c2, pull = kernels.interior_point.aim_centrally(
+        c1, c2, pull = native.interior_point.aim_centrally(
             *state, combined.y, c1, c2, _ALIKE * mu, mu / _ALIKE)
         corrected = _solve_kkt(state, at, cholesky, (c1, c2), pull)
         combined = max(combined, corrected, key=lambda step: step.reach)
@@ -260,20 +262,20 @@ def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, gap: float) -> _
     return combined
 
 
-def _aimed(state: tuple[Array, ...], at: _Iterate, cholesky: BlockCholesky,
+def _aimed(state: _State, at: _Iterate, cholesky: BlockCholesky,
            product: float) -> _Direction:
-    """Return the step by which all products become one number; state : see kernels."""
+    """Return the step by which all products become one number."""
     products = np.full_like(at.y, product)
-    pull = kernels.interior_point.aim(*state, products, products)
+    pull = native.interior_point.aim(*state, products, products)
     return _solve_kkt(state, at, cholesky, (products, products), pull)
 
 
-def _solve_kkt(state: tuple[Array, ...], at: _Iterate, cholesky: BlockCholesky,
+def _solve_kkt(state: _State, at: _Iterate, cholesky: BlockCholesky,
                products: _Products, pull: Array) -> _Direction:
     """Solve for the step whose complementarity products become these to first order."""
     x = cholesky.solve(at.system.transposed_times(pull))
     moved = at.system.times(x)
-    y, primal, dual, gap = kernels.interior_point.complete(*state, *products, moved, _FRACTION)
+    y, primal, dual, gap = native.interior_point.complete(*state, *products, moved, _FRACTION)
     return _Direction(x, moved, y, products, primal, dual, gap)
 
 
@@ -291,7 +293,7 @@ def _line_search(problem: L1Problem, at: _Iterate, direction: _Direction,
         for step in problem.step, problem.step_along:
             moved = step(at.poses, length * direction.x)
             after = problem.residual(moved)
-            cost, apart = kernels.interior_point.depart(
+            cost, apart = native.interior_point.depart(
                 after, at.residual, direction.residual, length)
             if not cost > best:
                 best = cost

@@ -35,16 +35,15 @@ restarts Applegate et al. (2021), see `primal_dual`. Scaling and refinement are 
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.linear_system import LinearSystem
-from l1slam_ros.core.graph.tiles import Single, Tiles
+from l1slam_ros.core.graph.tiles import LANES, Tiles
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
 from l1slam_ros.core.solvers.primal_dual import CHECK_EVERY, PrimalDualOptions, PrimalDualSolution
 
@@ -70,8 +69,8 @@ def scaled_system(system: LinearSystem) -> tuple[LinearSystem, Array]:
 
     x = R_v^-1 x_scaled of each keyframe; one without factors keeps its own scale.
     """
-    scaled, inverse = kernels.halpern.scale(system.keyframe, system.blocks, system.size)
-    return replace(system, blocks=scaled), inverse[:-1]
+    scaled, inverse = native.halpern.scale(system.keyframe, system.blocks, system.size)
+    return replace(system, blocks=scaled), inverse
 
 
 def minimise_l1_halpern(
@@ -129,7 +128,7 @@ class _Arrays:
 
     def __init__(self, system: LinearSystem, scaled: LinearSystem, y: Array):
         self._size, k = system.block_size, system.block_size
-        self._layout = Tiles(system.keyframe, system.size, kernels.halpern.LANES)
+        self._layout = Tiles(system.keyframe, system.size)
         columns = scaled.blocks.reshape(-1, 2 * k * k)
         dual = np.clip(y, -1, 1).reshape(-1, k)
         self._tiles = self._layout.pack(np.concatenate((columns, dual, dual, dual), axis=1))
@@ -137,7 +136,7 @@ class _Arrays:
             self._tiles[:, row: row + k] for row in range(2 * k * k, 2 * k * k + 3 * k, k))
         self.x, self._z, self._g, self.x_bar, self.g_bar = np.zeros(
             (5, system.size + 1, k), np.float32)
-        self.y_bar = np.empty((len(self._tiles), k, kernels.halpern.LANES), np.float32)
+        self.y_bar = np.empty((len(self._tiles), k, LANES), np.float32)
         self._g[:-1] = scaled.transposed_times(dual.ravel()).reshape(-1, k)
 
     def set_origin(self, residual: Array) -> None:
@@ -147,14 +146,13 @@ class _Arrays:
 
     def iterate(self, weight: float, since: int, count: int) -> None:
         """Do `count` iterations; since : those since the restart."""
-        self._call(kernels.halpern.iterate, self.x, self._z, self._g, weight, since, count)
+        native.halpern.iterate(self._tiles, self._layout.keyframe, self.x, self._z, self._g,
+                               weight, since, count)
 
     def look(self, weight: float) -> tuple[float, float, float]:
         """Set the candidate; return the squared fixed-point residual, its cost and dual value."""
-        squared, cost, dual = self._call(
-            kernels.halpern.look, self.x, self._g, weight, self.x_bar, self.g_bar,
-            self._flat(self.y_bar))
-        return squared, cost, dual
+        return native.halpern.look(self._tiles, self._layout.keyframe, self.x, self._g, weight,
+                                   self.x_bar, self.g_bar, self.y_bar)
 
     def movement(self) -> tuple[Any, Any]:
         """Return how far the candidate is from the last restart: primal and dual."""
@@ -169,15 +167,6 @@ class _Arrays:
     def dual(self) -> Array:
         """Return y of the candidate, (rows,)."""
         return self._layout.unpack(self.y_bar).ravel()
-
-    def _call(self, kernel: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a compiled loop; its K tells the compiler the block size."""
-        return kernel(self._flat(self._tiles), self._layout.keyframes, *arguments,
-                      (0,) * self._size)
-
-    @staticmethod
-    def _flat(tiles: Single) -> Single:
-        return tiles.reshape(len(tiles), -1)
 
 
 class _Run:

@@ -246,8 +246,7 @@ def _processor() -> list[str]:
     return [line for line in first.splitlines() if line.startswith(_PROCESSOR)]
 
 
-_SHARED = [KERNELS / 'compiled.py', *sorted(Path(__file__).parent.glob('*.py')),
-           *sorted((KERNELS / 'vectors').glob('*.py'))]
+_SHARED = [KERNELS / 'compiled.py', *sorted(Path(__file__).parent.glob('*.py'))]
 _imported: dict[Path, tuple[int, int]] = {}
 for _source in _SHARED:
     note_import(_source)

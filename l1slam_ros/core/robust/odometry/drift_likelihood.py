@@ -30,7 +30,7 @@ Source: ours, defended by `test_drift.py`.
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import covariance_of
@@ -209,7 +209,7 @@ class _DriftLikelihood:
         log_room = np.log(2 * np.pi**2 * np.var(at))
         log_ratio = np.empty((len(_NOISE), len(low)))
         for row, q in zip(log_ratio, _NOISE, strict=True):
-            square, log_det = kernels.prediction.normalise(q * spread + own, error)
+            square, log_det = native.prediction.normalise(q * spread + own, error)
             row[:] = log_room - (square + log_det + 3 * np.log(2 * np.pi)) / 2
         values = _log_likelihood(np.exp(log_ratio), self.weight) + log_prior(
             drift, usual + _NOISE * self.walk)

@@ -18,7 +18,7 @@ from math import lgamma
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.robust.gating import SAME, TINY
 from l1slam_ros.core.robust.innovation import claimed_volume, log_likelihood_ratio
@@ -69,7 +69,7 @@ class Motion:
         # The steps as a kernel density with Scott's bandwidth.
         covariance = spread + self.covariance * n ** (-2 / (k + 4))
         repeated = np.tile(covariance, (n, 1, 1))
-        return kernels.prediction.normalise(repeated, self.step - step)[0]
+        return native.prediction.normalise(repeated, self.step - step)[0]
 
 
 def steps_of(growth: Growth, rows: Indices) -> Array:
@@ -98,7 +98,7 @@ def usual_motion(growth: Growth) -> Motion:
 def _square(error: Array, covariance: Array) -> tuple[Array, Array]:
     """Return e'C^-1 e of errors (m, k) and ln det C, (m,); C (m, k, k), or of all (k, k)."""
     m, k = error.shape
-    return kernels.prediction.normalise(np.broadcast_to(covariance, (m, k, k)).copy(), error)
+    return native.prediction.normalise(np.broadcast_to(covariance, (m, k, k)).copy(), error)
 
 
 def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
@@ -130,7 +130,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     innovation[cut, :, 0] = -without.system.b.reshape(-1, k)
     root = unwhitening(measured, rows)
     spread = root @ inverse @ root.transpose(0, 2, 1)
-    square, log_det = kernels.prediction.normalise(inverse.copy(), innovation[:, :, 0])
+    square, log_det = native.prediction.normalise(inverse.copy(), innovation[:, :, 0])
     # With the estimated noise, or with the stated one.
     found = max((r[~cut] ** 2).sum() / np.trace(R[~cut], axis1=1, axis2=2).sum(), 1.0)
     said = growth.noise.said[0]
