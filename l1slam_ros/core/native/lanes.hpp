@@ -65,8 +65,11 @@ template <int N> struct Lanes {
 #endif
 #if defined(__AVX__)
             if constexpr (W == 4) {
-                r = (Register)_mm256_maskload_pd(from + p * W, mask(left));
-                all.part[p] = r;
+                const double* at = from + p * W;
+                all.part[p] = (Register)(
+                    left >= 4   ? _mm256_loadu_pd(at)
+                    : left == 2 ? _mm256_zextpd128_pd256(_mm_loadu_pd(at))
+                                : _mm256_maskload_pd(at, mask(left)));
                 continue;
             }
 #endif
