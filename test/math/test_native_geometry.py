@@ -52,6 +52,56 @@ def step(manifold, x, axis, length):
 
 
 @MANIFOLDS
+def test_steps_are_products_of_matrices(manifold, rng):
+    """None, short ones, and turns beyond pi."""
+    x, d = poses_of(manifold, rng), 3 * rng.standard_normal((M, manifold.TANGENT_SIZE))
+    d[:9] *= np.array([0, 1e-300, 1e-160, 1e-9, 1e-8, 1e-4, 0.1, 1, 2])[:, None]
+    t, turn = d[:, manifold.TRANSLATION], d[:, manifold.ROTATION]
+    about = turn if manifold is se3 else turn * [0, 0, 1]
+    size = manifold.positions(x).shape[1]
+    R = Rotation.from_rotvec(about).as_matrix()[:, :size, :size]
+    moved = kernels_of(manifold).retract(x, d)
+    assert_allclose(manifold.rotation(moved), manifold.rotation(x) @ R, atol=1e-13)
+    assert_allclose(manifold.positions(moved), manifold.positions(x) + np.einsum(
+        'nab,nb->na', manifold.rotation(x), t), atol=1e-13)
+
+
+@MANIFOLDS
+def test_poses_are_products_along_their_trees(manifold, rng):
+    """Of two trees, whose nodes come in any order; a ring is none."""
+    relative, name = poses_of(manifold, rng), rng.permutation(M)
+    parent = np.empty(M, np.int64)
+    parent[name] = name[[0, 1, *(rng.integers(0, k) for k in range(2, M))]]
+    poses = native.spanning_tree.compose(parent, relative)
+    for k in range(M):
+        expected, v = relative[[k]], k
+        while parent[v] != v:
+            v = parent[v]
+            expected = manifold.compose(relative[[v]], expected)
+        assert_allclose(manifold.local(poses[[k]], expected), 0, atol=1e-12)
+    parent[name[[0, 1]]] = name[[1, 0]]
+    with pytest.raises(TypeError, match='parent must be that of trees'):
+        native.spanning_tree.compose(parent, relative)
+
+
+def test_trees_are_breadth_first(rng):
+    n = 40
+    i, j = rng.integers(0, n - 3, (2, 60))  # the last three are joined with none
+    roots = np.array([5, n - 1, 5])
+    parent = native.spanning_tree.parents(i, j, n, roots)
+    expected, reached = {5: 5}, [5]
+    for v in reached:
+        for other in [*np.sort(j[i == v]), *np.sort(i[j == v])]:
+            if other not in expected:
+                expected[other] = v
+                reached.append(other)
+    expected[n - 1] = n - 1
+    assert parent.tolist() == [expected.get(v, -1) for v in range(n)]
+    with pytest.raises(TypeError, match='nodes below n'):
+        native.spanning_tree.parents(i, j, int(j.max()), roots[:1])
+
+
+@MANIFOLDS
 def test_residuals_are_those_of_matrices(manifold, rng):
     z, x_i, x_j = (poses_of(manifold, rng) for _ in range(3))
     assert_allclose(kernels_of(manifold).residual(z, x_i, x_j), residual(manifold, z, x_i, x_j),

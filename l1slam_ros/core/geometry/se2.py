@@ -72,7 +72,7 @@ def between(a: Array, b: Array) -> Array:
 
 def retract(pose: Array, step: Array) -> Array:
     """Return pose v2t(step); a pose of SE(2) and its tangent share their coordinates."""
-    return compose(pose, step)
+    return native.se2.retract(np.ascontiguousarray(pose), np.ascontiguousarray(step))
 
 
 def local(a: Array, b: Array) -> Array:

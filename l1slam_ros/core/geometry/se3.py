@@ -85,12 +85,6 @@ def _pose(t: Array, q: Array) -> Array:
     return np.concatenate((t, np.where(q[..., 3:] < 0, -scale, scale) * q), axis=-1)
 
 
-def _exp(omega: Array) -> Array:
-    """Return the quaternion of a turn by |omega| about omega."""
-    half = np.linalg.norm(omega, axis=-1, keepdims=True) / 2
-    return np.concatenate((omega / 2 * np.sinc(half / np.pi), np.cos(half)), axis=-1)
-
-
 def _log(q: Array) -> Array:
     """Return the shortest omega, |omega| <= pi, of a quaternion with qw >= 0."""
     sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
@@ -124,8 +118,7 @@ def between(a: Array, b: Array) -> Array:
 
 def retract(pose: Array, step: Array) -> Array:
     """Return pose (rho, exp omega), (n, 7)."""
-    q = pose[..., 3:]
-    return _pose(pose[..., :3] + _turned(q, step[..., :3]), _times(q, _exp(step[..., 3:])))
+    return native.se3.retract(np.ascontiguousarray(pose), np.ascontiguousarray(step))
 
 
 def local(a: Array, b: Array) -> Array:

@@ -71,7 +71,7 @@ class GraphProblem:
         carried = manifold.adjoint(manifold.inverse(relative)) @ step[before, :, None]
         chain = manifold.retract(poses, step)
         chain[child] = manifold.retract(relative, step[child] - carried[..., 0])
-        return compose_tree(manifold, parent, chain)
+        return compose_tree(parent, chain)
 
     def curvature(self, poses: Array, dual: Array) -> Array:
         """Return the Hessian of dual'e for each factor, (m, 2, r, 2 k), see `Manifold`."""

@@ -16,8 +16,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from l1slam_ros.core import native
 from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 
 
@@ -76,40 +77,17 @@ def parents(i: Indices, j: Indices, n: int, roots: Sequence[int]) -> Indices:
 
     i, j : (m,) ends of the edges; roots : one tree after the other, each its own parent
     """
-    near, far = np.concatenate((i, j)), np.concatenate((j, i))
-    order = np.lexsort((far, np.arange(len(near)) >= len(i), near))
-    start = np.searchsorted(near[order], np.arange(n + 1)).tolist()
-    neighbours = far[order].tolist()
-    parent = [-1] * n
-    for first in roots:
-        if parent[first] >= 0:
-            continue
-        # One by one: a graph is often nearly a chain, with as many levels as keyframes.
-        parent[first] = first
-        reached = [first]
-        for k in reached:
-            for other in neighbours[start[k]:start[k + 1]]:
-                if parent[other] < 0:
-                    parent[other] = k
-                    reached.append(other)
-    return np.array(parent)
+    return native.spanning_tree.parents(i, j, n, np.array(roots, np.int64))
 
 
-def compose_tree(manifold: Manifold, parent: Indices, relative: Array) -> Array:
+def compose_tree(parent: Indices, relative: Array) -> Array:
     """
     Return each pose as the product of the relative poses from its root down, (n, p).
 
     parent : (n,), a root is its own parent; relative : (n, p), seen from the parent; the roots'
-    rows are their poses. Pointer doubling: as many compositions of whole arrays as the tree's
-    depth has binary digits.
+    rows are their poses
     """
-    poses: Array = relative.copy()
-    root = parent == np.arange(len(parent))
-    while not root.all():
-        poses = np.where(root[:, None], poses, manifold.compose(poses[parent], poses))
-        root = root | root[parent]
-        parent = parent[parent]
-    return poses
+    return native.spanning_tree.compose(parent, relative)
 
 
 def _compose_along(graph: FactorGraph, parent: Indices, candidates: Indices) -> Array:
@@ -135,7 +113,7 @@ def _compose_along(graph: FactorGraph, parent: Indices, candidates: Indices) -> 
     downwards = (factors.i[chosen] == parent[child])[:, None]
     relative = manifold.identity(n)
     relative[child] = np.where(downwards, measurement, manifold.inverse(measurement))
-    return compose_tree(manifold, parent, relative)
+    return compose_tree(parent, relative)
 
 
 def pair_key(i: Indices, j: Indices, n: int) -> Indices:

@@ -10,6 +10,7 @@ from . import prediction as prediction
 from . import scans as scans
 from . import se2 as se2
 from . import se3 as se3
+from . import spanning_tree as spanning_tree
 from . import substitution as substitution
 from . import symbolic as symbolic
 

@@ -179,10 +179,20 @@ inline PyObject* description(PyObject* object) {
     return text;
 }
 
-// What Python calls for F. The interpreter's lock is let go unless the function is BRIEF: whoever
-// lets go of it may have to wait until another thread lets go of it in turn.
-template <auto F, bool BRIEF> struct Function;
-template <class R, class... Ts, R (*F)(Ts...), bool BRIEF> struct Function<F, BRIEF> {
+// How many numbers an argument holds, if it is an array.
+template <class T> int64_t entries(const T&) { return 0; }
+template <class T, int N> int64_t entries(const Array<T, N>& array) {
+    int64_t count = 1;
+    for (int n = 0; n < N; n++) count *= array.shape[n];
+    return count;
+}
+
+// What Python calls for F. The interpreter's lock is let go unless the function is BRIEF, or its
+// arrays hold FEW numbers or less: whoever lets go of it may have to wait until another thread lets
+// go of it in turn.
+template <auto F, bool BRIEF, int64_t FEW = -1> struct Function;
+template <class R, class... Ts, R (*F)(Ts...), bool BRIEF, int64_t FEW>
+struct Function<F, BRIEF, FEW> {
     inline static const char* signature = "";
 
     static PyObject* call(PyObject*, PyObject* const* given, Py_ssize_t count) {
@@ -210,7 +220,8 @@ template <class R, class... Ts, R (*F)(Ts...), bool BRIEF> struct Function<F, BR
     static PyObject* run(PyObject* const* given, std::index_sequence<I...>) {
         std::tuple<Ts...> values{};
         if (!(convert<I>(given, std::get<I>(values)) && ...)) return nullptr;
-        PyThreadState* state = BRIEF ? nullptr : PyEval_SaveThread();
+        const bool is_brief = BRIEF || (entries(std::get<I>(values)) + ... + 0) <= FEW;
+        PyThreadState* state = is_brief ? nullptr : PyEval_SaveThread();
         try {
             if constexpr (std::is_void_v<R>) {
                 F(std::get<I>(values)...);
@@ -232,11 +243,12 @@ template <class R, class... Ts, R (*F)(Ts...), bool BRIEF> struct Function<F, BR
     }
 };
 
-template <auto F, bool BRIEF> PyMethodDef method(const char* name, const char* signature) {
-    Function<F, BRIEF>::signature = signature;
+template <auto F, bool BRIEF, int64_t FEW = -1>
+PyMethodDef method(const char* name, const char* signature) {
+    Function<F, BRIEF, FEW>::signature = signature;
     return {name,
             reinterpret_cast<PyCFunction>(
-                reinterpret_cast<void (*)()>(&Function<F, BRIEF>::call)),
+                reinterpret_cast<void (*)()>(&Function<F, BRIEF, FEW>::call)),
             METH_FASTCALL, signature};
 }
 // Entries of a table of methods: a function of this namespace and the names of its arguments.
@@ -245,3 +257,6 @@ template <auto F, bool BRIEF> PyMethodDef method(const char* name, const char* s
     method<&function, false>(#function, #function "(" arguments ")\n--\n\n")
 #define BRIEF(function, arguments) \
     method<&function, true>(#function, #function "(" arguments ")\n--\n\n")
+// BY_SIZE does so where all arrays together are that small: for a few nanoseconds a number.
+#define BY_SIZE(function, arguments) \
+    method<&function, false, 5000>(#function, #function "(" arguments ")\n--\n\n")

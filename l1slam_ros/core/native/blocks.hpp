@@ -301,12 +301,12 @@ inline void assemble(Vector<double> panels, Keyframes keyframe, Vector<const int
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(multiply, "keyframe, blocks, x"),
-    FUNCTION(multiply_transposed, "keyframe, blocks, y, n"),
-    FUNCTION(whiten, "roots, vectors"),
-    FUNCTION(unwhiten_dual, "roots, duals"),
-    FUNCTION(whiten_blocks, "roots, blocks"),
-    FUNCTION(assemble,
+    BY_SIZE(multiply, "keyframe, blocks, x"),
+    BY_SIZE(multiply_transposed, "keyframe, blocks, y, n"),
+    BY_SIZE(whiten, "roots, vectors"),
+    BY_SIZE(unwhiten_dual, "roots, duals"),
+    BY_SIZE(whiten_blocks, "roots, blocks"),
+    BY_SIZE(assemble,
              "panels, keyframe, address, width, turned, corner, stride, blocks, weights, "
              "diagonal, curvature, share"),
     {}};

@@ -348,7 +348,7 @@ inline int64_t factorise(Vector<double> panels, PANELS_ARGUMENTS, Vector<const i
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(factorise, "panels, " PANELS_NAMES ", share, k, threads"),
+    BY_SIZE(factorise, "panels, " PANELS_NAMES ", share, k, threads"),
     {}};
 
 }  // namespace cholesky

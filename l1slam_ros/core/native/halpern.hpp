@@ -293,9 +293,9 @@ inline std::tuple<double, double, double> look(Tiles tiles, Keyframes keyframe, 
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(scale, "keyframe, blocks, n"),
+    BY_SIZE(scale, "keyframe, blocks, n"),
     FUNCTION(iterate, "tiles, keyframe, x, z, g, weight, first, count"),
-    FUNCTION(look, "tiles, keyframe, x, g, weight, x_bar, g_bar, y_bar"),
+    BY_SIZE(look, "tiles, keyframe, x, g, weight, x_bar, g_bar, y_bar"),
     {}};
 
 }  // namespace halpern

@@ -186,15 +186,15 @@ inline std::tuple<double, double> depart(Rows after, Rows e, Rows moved, double 
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(begin, "e, mu"),
-    FUNCTION(weigh, "u, v, s, t"),
-    FUNCTION(aim, STATE_NAMES ", c1, c2"),
-    FUNCTION(aim_combined, STATE_NAMES ", dy, mu, most"),
-    FUNCTION(aim_centrally, STATE_NAMES ", dy, c1, c2, least, most"),
-    FUNCTION(complete, STATE_NAMES ", c1, c2, moved, fraction"),
-    FUNCTION(advance, "u, v, s, t, y, c1, c2, dy, primal, dual, least"),
-    FUNCTION(missing, "u, v, s, t, e"),
-    FUNCTION(depart, "after, e, moved, length"),
+    BY_SIZE(begin, "e, mu"),
+    BY_SIZE(weigh, "u, v, s, t"),
+    BY_SIZE(aim, STATE_NAMES ", c1, c2"),
+    BY_SIZE(aim_combined, STATE_NAMES ", dy, mu, most"),
+    BY_SIZE(aim_centrally, STATE_NAMES ", dy, c1, c2, least, most"),
+    BY_SIZE(complete, STATE_NAMES ", c1, c2, moved, fraction"),
+    BY_SIZE(advance, "u, v, s, t, y, c1, c2, dy, primal, dual, least"),
+    BY_SIZE(missing, "u, v, s, t, e"),
+    BY_SIZE(depart, "after, e, moved, length"),
     {}};
 
 }  // namespace interior_point

@@ -65,8 +65,11 @@ template <int N> struct Lanes {
 #endif
 #if defined(__AVX__)
             if constexpr (W == 4) {
-                r = (Register)_mm256_maskload_pd(from + p * W, mask(left));
-                all.part[p] = r;
+                const double* at = from + p * W;
+                all.part[p] = (Register)(
+                    left >= 4   ? _mm256_loadu_pd(at)
+                    : left == 2 ? _mm256_zextpd128_pd256(_mm_loadu_pd(at))
+                                : _mm256_maskload_pd(at, mask(left)));
                 continue;
             }
 #endif
@@ -87,8 +90,18 @@ template <int N> struct Lanes {
             }
 #endif
 #if defined(__AVX__)
+            // By parts: a masked store takes many times as long on some processors.
             if constexpr (W == 4) {
-                _mm256_maskstore_pd(to + p * W, mask(left), (__m256d)part[p]);
+                const __m128d low = _mm256_castpd256_pd128((__m256d)part[p]);
+                if (left >= 4) {
+                    _mm256_storeu_pd(to + p * W, (__m256d)part[p]);
+                } else if (left >= 2) {
+                    _mm_storeu_pd(to + p * W, low);
+                    if (left == 3)
+                        _mm_store_sd(to + p * W + 2, _mm256_extractf128_pd((__m256d)part[p], 1));
+                } else if (left == 1) {
+                    _mm_store_sd(to + p * W, low);
+                }
                 continue;
             }
 #endif

@@ -11,6 +11,7 @@
 #include "scans.hpp"
 #include "se2.hpp"
 #include "se3.hpp"
+#include "spanning_tree.hpp"
 #include "substitution.hpp"
 #include "symbolic.hpp"
 
@@ -31,6 +32,7 @@ const Part parts[] = {
     {"scans", scans::methods},
     {"se2", se2::methods},
     {"se3", se3::methods},
+    {"spanning_tree", spanning_tree::methods},
     {"substitution", substitution::methods},
     {"symbolic", symbolic::methods},
 };

@@ -316,12 +316,12 @@ inline Squares normalise_pairs(Array<const double, 3> covariance, Matrix<const d
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(gather, "keyframe, blocks, y, product"),
-    FUNCTION(solve_many, "panels, " PANELS_NAMES ", position, right"),
-    FUNCTION(left_over, "keyframe, blocks, x, y"),
-    FUNCTION(moved, "keyframe, blocks, x"),
-    FUNCTION(normalise, "covariance, residual"),
-    FUNCTION(normalise_pairs, "covariance, residual, shared, first, second"),
+    BY_SIZE(gather, "keyframe, blocks, y, product"),
+    BY_SIZE(solve_many, "panels, " PANELS_NAMES ", position, right"),
+    BY_SIZE(left_over, "keyframe, blocks, x, y"),
+    BY_SIZE(moved, "keyframe, blocks, x"),
+    BY_SIZE(normalise, "covariance, residual"),
+    BY_SIZE(normalise_pairs, "covariance, residual, shared, first, second"),
     {}};
 
 }  // namespace prediction

@@ -71,6 +71,27 @@ struct Seen {
         : x(c * (j[0] - i[0]) + s * (j[1] - i[1])), y(c * (j[1] - i[1]) - s * (j[0] - i[0])) {}
 };
 
+// a b.
+inline void compose(const double* a, const double* b, double c, double s, double* product) {
+    product[0] = a[0] + c * b[0] - s * b[1];
+    product[1] = a[1] + s * b[0] + c * b[1];
+    product[2] = wrapped(a[2] + b[2]);
+}
+inline void compose(const double* a, const double* b, double* product) {
+    compose(a, b, std::cos(a[2]), std::sin(a[2]), product);
+}
+
+// Poses moved by right steps: a pose and its tangent share their coordinates.
+inline Matrix<double> retract(Poses pose, Poses step) {
+    require(pose.shape[1] == 3, "pose must be (n, 3)");
+    require(step.size() == pose.size() && step.shape[1] == 3, "step must be (n, 3), like pose");
+    auto moved = new_array<double, 2>({pose.size(), 3});
+    const Turns of(pose);
+    for (int64_t f = 0; f < pose.size(); f++)
+        compose(pose[f], step[f], of.c[f], of.s[f], moved[f]);
+    return moved;
+}
+
 inline Matrix<double> residual(Poses z, Poses x_i, Poses x_j) {
     check(z, x_i, x_j);
     auto e = new_array<double, 2>({z.shape[0], 3});
@@ -125,9 +146,10 @@ inline Array<double, 4> curvature(Poses z, Poses x_i, Poses x_j, Poses dual) {
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(residual, "z, x_i, x_j"),
-    FUNCTION(jacobians, "z, x_i, x_j"),
-    FUNCTION(curvature, "z, x_i, x_j, dual"),
+    BY_SIZE(retract, "pose, step"),
+    BY_SIZE(residual, "z, x_i, x_j"),
+    BY_SIZE(jacobians, "z, x_i, x_j"),
+    BY_SIZE(curvature, "z, x_i, x_j, dual"),
     {}};
 
 }  // namespace se2

@@ -2,6 +2,9 @@
 
 from l1slam_ros.core.geometry.manifold import Array
 
+def retract(pose: Array, step: Array) -> Array:
+    """Return pose v2t(step), (n, 3); step (n, 3) [m, m, rad]."""
+
 def residual(z: Array, x_i: Array, x_j: Array) -> Array:
     """Return t2v(Z^-1 Xi^-1 Xj), (n, 3) [m, m, rad]; z, x_i, x_j (n, 3)."""
 

@@ -2,6 +2,8 @@
 // SE(3) factor by factor: the residual e = (t, 2 q_v) of Z^-1 Xi^-1 Xj, Jacobians, curvature.
 #pragma once
 #include <algorithm>
+#include <cmath>
+#include <limits>
 
 #include "arrays.hpp"
 
@@ -35,6 +37,43 @@ inline Point turned_back(Quaternion q, Point v) {
     double c = 2 * (v.x * q.y - v.y * q.x);
     return {v.x + q.w * a + b * q.z - c * q.y, v.y + q.w * b + c * q.x - a * q.z,
             v.z + q.w * c + a * q.y - b * q.x};
+}
+
+// A quaternion whose squared norm is that near to 1 is left as it is.
+constexpr double UNIT = 4 * std::numeric_limits<double>::epsilon();
+
+// Write a pose, its quaternion normalised, qw >= 0.
+inline void write(Point t, Quaternion q, double* pose) {
+    const double square = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w;
+    double scale = std::abs(square - 1) <= UNIT ? 1.0 : 1 / std::sqrt(square);
+    if (q.w < 0) scale = -scale;
+    const double row[7] = {t.x, t.y, t.z, scale * q.x, scale * q.y, scale * q.z, scale * q.w};
+    std::copy(row, row + 7, pose);
+}
+
+// A pose times another one, of which only the turn may differ from a pose's: (t, q).
+inline void compose(const double* a, Point t, Quaternion q, double* to) {
+    const Quaternion back{-a[3], -a[4], -a[5], a[6]};
+    const Point moved = turned_back(back, t);
+    write({a[0] + moved.x, a[1] + moved.y, a[2] + moved.z}, product(back, q), to);
+}
+inline void compose(const double* a, const double* b, double* to) {
+    compose(a, {b[0], b[1], b[2]}, turn_of(b), to);
+}
+
+// Poses moved by right steps: (rho, exp omega).
+inline Matrix<double> retract(Poses pose, Matrix<const double> step) {
+    require(pose.shape[1] == 7, "pose must be (n, 7)");
+    require(step.size() == pose.size() && step.shape[1] == 6, "step must be (n, 6), n as of pose");
+    auto moved = new_array<double, 2>({pose.size(), 7});
+    for (int64_t f = 0; f < pose.size(); f++) {
+        const double* d = step[f];
+        const double half = std::sqrt(d[3] * d[3] + d[4] * d[4] + d[5] * d[5]) / 2;
+        const double scale = half == 0 ? 0.5 : std::sin(half) / (2 * half);
+        compose(pose[f], {d[0], d[1], d[2]},
+                {scale * d[3], scale * d[4], scale * d[5], std::cos(half)}, moved[f]);
+    }
+    return moved;
 }
 
 struct Square {
@@ -140,9 +179,10 @@ inline Array<double, 4> curvature(Poses z, Poses x_i, Poses x_j,
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(residual, "z, x_i, x_j"),
-    FUNCTION(jacobians, "z, x_i, x_j"),
-    FUNCTION(curvature, "z, x_i, x_j, dual"),
+    BY_SIZE(retract, "pose, step"),
+    BY_SIZE(residual, "z, x_i, x_j"),
+    BY_SIZE(jacobians, "z, x_i, x_j"),
+    BY_SIZE(curvature, "z, x_i, x_j, dual"),
     {}};
 
 }  // namespace se3

@@ -2,6 +2,9 @@
 
 from l1slam_ros.core.geometry.manifold import Array
 
+def retract(pose: Array, step: Array) -> Array:
+    """Return pose (rho, exp omega), (n, 7); step (n, 6) [m, rad]."""
+
 def residual(z: Array, x_i: Array, x_j: Array) -> Array:
     """Return (t, 2 q_v) of Z^-1 Xi^-1 Xj, (n, 6) [m, rad]; z, x_i, x_j (n, 7)."""
 

@@ -143,7 +143,7 @@ inline Matrix<double> solve(Vector<const double> panels, PANELS_ARGUMENTS,
 }
 
 static PyMethodDef methods[] = {
-    FUNCTION(solve, "panels, " PANELS_NAMES ", position, right"),
+    BY_SIZE(solve, "panels, " PANELS_NAMES ", position, right"),
     {}};
 
 }  // namespace substitution
