@@ -38,10 +38,10 @@ from l1slam_ros.io.progress import Progress
 
 # Modules of `kernels` for a sparse graph, for judging loops, for a dense graph, and for a graph
 # that grows. Those that take long to compile come first.
-SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
+SPARSE = ('cholesky', 'substitution', 'blocks', 'interior_point', 'se2')
 JUDGEMENT = ('prediction',)
 DENSE = ('halpern',)
-ONLINE = ('border', 'growth.elimination', 'growth.points')
+ONLINE = ('border', 'growth.points')
 # Modules of `core` for matching scans.
 SCANS = ('scans.kernels', 'scans.search_kernels')
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])

@@ -4,6 +4,7 @@
 #include "blocks.hpp"
 #include "border.hpp"
 #include "cholesky.hpp"
+#include "dissection.hpp"
 #include "interior_point.hpp"
 #include "ordering.hpp"
 #include "scans.hpp"
@@ -22,6 +23,7 @@ const Part parts[] = {
     {"blocks", blocks::methods},
     {"border", border::methods},
     {"cholesky", cholesky::methods},
+    {"dissection", dissection::methods},
     {"interior_point", interior_point::methods},
     {"ordering", ordering::methods},
     {"scans", scans::methods},
