@@ -193,7 +193,7 @@ def lowest(requirement):
 
 def damage(cache):
     """Leave half of one file of a cache, another one of something else, one with a wrong bit."""
-    first, other, last = (next(cache.glob(f'*.{name}')) for name in ('se2', 'symbolic', 'blocks'))
+    first, other, last = (next(cache.glob(f'*.{name}')) for name in ('se2', 'cholesky', 'blocks'))
     whole = first.read_bytes()
     first.write_bytes(whole[:len(whole) // 2])
     other.write_text('nothing of ours')

@@ -38,10 +38,10 @@ from l1slam_ros.io.progress import Progress
 
 # Modules of `kernels` for a sparse graph, for judging loops, for a dense graph, and for a graph
 # that grows.
-SPARSE = ('ordering', 'symbolic')
+SPARSE: tuple[str, ...] = ()
 JUDGEMENT: tuple[str, ...] = ()
 DENSE: tuple[str, ...] = ()
-ONLINE = ('border', 'growth.elimination', 'growth.points')
+ONLINE = ('border', 'growth.points')
 # Modules of `core` for matching scans.
 SCANS = ('scans.kernels', 'scans.search_kernels')
 STEPS = (*ONLINE, *SPARSE)

@@ -159,14 +159,10 @@ def test_small_pivots_are_not_taken_for_rounding(stiff):
 
 
 def test_too_much_fill_is_refused():
-    """Found, but too large; and given up on the way, which is a bound from below."""
     keyframe = np.array([(i, j) for i in range(20) for j in range(i)])
-    below = 20 * 19 // 2
     assert find_pattern(keyframe, 20, 20**2).blocks == 20**2
-    for most, least in (20**2 - 1, 20**2), (below - 1, below):
-        with pytest.raises(FillError, match=f'20 keyframes and {below} factors .* {least} blocks '
-                           'or more'):
-            find_pattern(keyframe, 20, most)
+    with pytest.raises(FillError, match='20 keyframes and 190 factors has 400 blocks'):
+        find_pattern(keyframe, 20, 20**2 - 1)
 
 
 @pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from l1slam_ros.core import kernels, native
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import FactorGraph, lowest_joined
 
@@ -177,7 +177,7 @@ def neighbours(keyframe: Indices, size: int) -> tuple[NDArray[np.int32], NDArray
 
     Each once, ascending, both ways round; keyframe, size : see `LinearSystem`
     """
-    start, adjacent = kernels.symbolic.neighbours(np.ascontiguousarray(keyframe), size)
+    start, adjacent = native.symbolic.neighbours(np.ascontiguousarray(keyframe), size)
     return start, adjacent
 
 

@@ -3,6 +3,7 @@
 from . import blocks as blocks
 from . import border as border
 from . import cholesky as cholesky
+from . import dissection as dissection
 from . import halpern as halpern
 from . import interior_point as interior_point
 from . import ordering as ordering

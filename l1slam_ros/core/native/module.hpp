@@ -4,6 +4,7 @@
 #include "blocks.hpp"
 #include "border.hpp"
 #include "cholesky.hpp"
+#include "dissection.hpp"
 #include "halpern.hpp"
 #include "interior_point.hpp"
 #include "ordering.hpp"
@@ -25,6 +26,7 @@ const Part parts[] = {
     {"blocks", blocks::methods},
     {"border", border::methods},
     {"cholesky", cholesky::methods},
+    {"dissection", dissection::methods},
     {"halpern", halpern::methods},
     {"interior_point", interior_point::methods},
     {"ordering", ordering::methods},

@@ -33,18 +33,10 @@ from l1slam_ros.core.graph.linear_system import (
 )
 
 Places = NDArray[np.int32]
-Columns = tuple[Places, Indices, Places]
 _NONE = np.zeros(0, np.int64)
-_NO_COLUMNS = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32)
 
-# Multiplications per keyframe from which a better order saves more time than it takes to find.
-_LONG = 8000
-# Multiplications, some 50 ms, from which separators are tried. The loops that find them are
-# compiled at their first use on a machine, which takes 5 s.
+# Multiplications, some 15 ms, from which an order whose factors come and go is not found anew.
 VAST = 1.5e8
-# If keyframes have more neighbours than this in the mean, separators save next to nothing, and
-# levels only add: of simulated worlds, a quarter more work at 24 neighbours, twice as much at 28.
-_CROWDED = 20
 # A graph that has grown by more than this fraction is ordered anew, which is rare. Without that,
 # City's last factorisation, six thousand keyframes later, would do a quarter more work.
 GROWN = 1.1
@@ -69,7 +61,7 @@ _FACTORISATIONS, _RATE = 20, 1e10
 # 25, 31 and 45 of 25,000, 100,000, 200,000 and 1,000,000.
 _WIDE_GRAPH = 10_000
 # Seconds a keyframe to find separators over the part of all multiplications that they spare.
-_SEARCH = 1.4e-5 / 0.5
+_SEARCH = 6e-6 / 0.3
 
 
 @dataclass(frozen=True)
@@ -80,18 +72,16 @@ class Pattern:
     position : (n,) of each keyframe in that order; first : first position of each panel, and n;
     start, rows : the rows of panel s are rows[start[s]:start[s + 1]], positions; halves :
     (panels,) what to factorise at the same time, 0 and 1, and what after both, 2; work :
-    multiplications of blocks that one factorisation takes; columns : what it was laid out from,
-    see `kernels.ordering.minimum_degree`; found : how many keyframes there were when all of it
-    was.
+    multiplications of blocks that one factorisation takes; found : how many keyframes there were
+    when all of it was.
     """
 
-    position: Indices
-    first: Indices
+    position: Places
+    first: Places
     start: Indices
-    rows: Indices
+    rows: Places
     halves: NDArray[np.int8]
     work: float
-    columns: Columns
     found: int
 
     @property
@@ -110,41 +100,43 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
     """
     Return the best elimination order that is found, and the pattern of its factor.
 
-    By minimum degree; also by levels if a factorisation is long, by separators if it is vast.
+    By minimum degree; where the factorisations to come take long, also after separators, of
+    levels and of parts, have been put last.
 
     keyframe, size : as in `LinearSystem`; k : size of a block
     before : of fewer keyframes and factors. Up to `GROWN` times as many, only keyframes that new
         factors join and those above them in the elimination tree are ordered anew: that takes a
-        fifth of the time, and fills in little more
+        tenth of the time, and fills in little more
     uses : factorisations to come, None: those of an exact L1 map; few do not pay for separators
 
     Raises
     ------
-    FillError : the factor would have more than `most_blocks`, as far as it was looked at.
+    FillError : the factor would have more than `most_blocks`.
 
     """
     graph = neighbours(keyframe, size)
     if before is not None and before.found <= size < GROWN * before.found:
-        begun = kernels.growth.untouched(*graph, *before.columns)
-        pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), begun, before.found)
-        if pattern is not None and pattern.blocks <= most_blocks:
+        order = native.ordering.resume(*graph, before.position, before.first, before.start,
+                                       before.rows)
+        pattern = _laid_out(graph, order, before.found)
+        if pattern.blocks <= most_blocks:
             return pattern
-    pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
-    vast = max(VAST, _SEARCH * size * _RATE / (uses or _factorisations(size)))
-    is_crowded = len(graph[1]) >= _CROWDED * size
-    searches = [(kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, vast)]
-    stages: list[Places] = []
-    for dissect, least in searches[::-1 if size > _WIDE_GRAPH else 1]:
-        if pattern is None or (not is_crowded and pattern.work * k**3 > max(_LONG * size, least)):
-            stages.append(dissect(*graph))
-            if kernels.dissection.is_promising(stages):
-                found = _laid_out(graph, most_blocks, stages[-1], _NO_COLUMNS, size)
-                pattern = min(filter(None, (pattern, found)), key=lambda p: p.work, default=None)
-    blocks = most_blocks + 1 if pattern is None else pattern.blocks
-    if pattern is None or blocks > most_blocks:
+    order, work = native.ordering.minimum_degree(*graph, np.zeros(size, np.int32))
+    if work * k**3 * (uses or _factorisations(size)) > _SEARCH * _RATE * size:
+        for separators in native.ordering.levels, native.dissection.dissect:
+            other, its_work = native.ordering.minimum_degree(*graph, separators(*graph))
+            if its_work < work:
+                order, work = other, its_work
+    pattern = _laid_out(graph, order, size)
+    if pattern.blocks > most_blocks:
         raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors has '
-                        f'{blocks} blocks or more', blocks)
+                        f'{pattern.blocks} blocks', pattern.blocks)
     return pattern
+
+
+def _laid_out(graph: tuple[Places, Places], order: Places, found: int) -> Pattern:
+    """Return the pattern of an order; found : see `Pattern`."""
+    return Pattern(*native.symbolic.lay_out(*graph, order), found)
 
 
 def needs(graph: FactorGraph, blocks: float, work: float) -> memory.Needs:
@@ -176,17 +168,6 @@ def _bytes_of_block(graph: FactorGraph) -> int:
     # The chordal relaxation has blocks of a rotation matrix.
     parts |= {k, manifold.rotation(manifold.identity(1)).shape[-1]}
     return _NUMBER * sum(size * size for size in parts)
-
-
-def _laid_out(graph: tuple[Places, Places], most_blocks: int, stage: Places, begun: Columns,
-              found: int) -> Pattern | None:
-    """Return the pattern of a minimum degree order; None if it has too many blocks."""
-    if len(begun[-1]) > most_blocks:
-        return None
-    columns = kernels.ordering.minimum_degree(*graph, most_blocks, stage, *begun)
-    if len(columns[0]) < len(stage):
-        return None
-    return Pattern(*(*kernels.symbolic.lay_out(*columns), columns, found))
 
 
 class BlockCholesky:
@@ -286,7 +267,7 @@ class _Layout:
     Where in memory the blocks of one size lie.
 
     panels : all entries; shape : what describes the panels to the kernels; places : where in them
-    the blocks of factors and keyframes are, see `kernels.symbolic.block_addresses`.
+    the blocks of factors and keyframes are, see `native.symbolic.block_addresses`.
     """
 
     def __init__(self, pattern: Pattern, keyframe: Indices, block_size: int):
@@ -299,7 +280,7 @@ class _Layout:
         begin = -memory.ctypes.data // memory.itemsize % _LINE
         self.panels = memory[begin:begin + offset[-1]]
         self.shape = (pattern.first, pattern.start, pattern.rows, offset, stride)
-        self.places: _Places = kernels.symbolic.block_addresses(
+        self.places: _Places = native.symbolic.block_addresses(
             keyframe, pattern.position, *self.shape, block_size)
 
 
@@ -329,7 +310,7 @@ def cholesky_of(graph: FactorGraph, before: Pattern | None = None,
         takes = needs(graph, error.blocks, 0.0).memory
         raise FillError(
             f'factorising {graph.n_poses} keyframes and {len(graph.between)} factors takes '
-            f'{memory.in_gigabytes(takes)} of memory or more, and '
+            f'{memory.in_gigabytes(takes)} of memory, and '
             f'{memory.in_gigabytes(memory.free())} are free', error.blocks) from error
     return BlockCholesky(pattern, keyframe, loose_keyframes(graph))
 
