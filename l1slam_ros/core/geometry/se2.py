@@ -72,7 +72,8 @@ def between(a: Array, b: Array) -> Array:
 
 def retract(pose: Array, step: Array) -> Array:
     """Return pose v2t(step); a pose of SE(2) and its tangent share their coordinates."""
-    return native.se2.retract(np.ascontiguousarray(pose), np.ascontiguousarray(step))
+    rows = (np.ascontiguousarray(each).reshape(-1, 3) for each in (pose, step))
+    return native.se2.retract(*rows).reshape(pose.shape)
 
 
 def local(a: Array, b: Array) -> Array:

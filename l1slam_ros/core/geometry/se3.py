@@ -118,7 +118,8 @@ def between(a: Array, b: Array) -> Array:
 
 def retract(pose: Array, step: Array) -> Array:
     """Return pose (rho, exp omega), (n, 7)."""
-    return native.se3.retract(np.ascontiguousarray(pose), np.ascontiguousarray(step))
+    rows = np.ascontiguousarray(pose).reshape(-1, 7), np.ascontiguousarray(step).reshape(-1, 6)
+    return native.se3.retract(*rows).reshape(pose.shape)
 
 
 def local(a: Array, b: Array) -> Array:
