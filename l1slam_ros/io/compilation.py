@@ -41,7 +41,7 @@ from l1slam_ros.io.progress import Progress
 SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
 JUDGEMENT = ('prediction',)
 DENSE = ('halpern',)
-ONLINE = ('border', 'growth.elimination', 'growth.points')
+ONLINE = ('growth.elimination',)
 # Modules of `core` for matching scans.
 SCANS = ('scans.kernels', 'scans.search_kernels')
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])

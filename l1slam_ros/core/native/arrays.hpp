@@ -14,9 +14,11 @@
 #define NPY_TARGET_VERSION NPY_1_23_API_VERSION
 #include <numpy/arrayobject.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
+#include <memory>
 #include <new>
 #include <stdexcept>
 #include <string>
@@ -155,6 +157,39 @@ template <class... Ts> struct Convert<std::tuple<Ts...>> {
     }
 };
 
+
+// An object of C++ that Python holds: a type of its own, made by `add_type`, without a constructor.
+// Functions take it as a pointer, their first argument; they are its methods.
+template <class T> struct Held {
+    PyObject_HEAD
+    T* object;
+    inline static PyTypeObject* type = nullptr;
+
+    static void end(PyObject* self) {
+        PyTypeObject* own = Py_TYPE(self);
+        delete reinterpret_cast<Held*>(self)->object;
+        PyObject_Free(self);
+        Py_DECREF(own);
+    }
+};
+template <class T> struct Convert<T*> {
+    static bool from(PyObject* object, T*& value, std::string& problem) {
+        if (!PyObject_TypeCheck(object, Held<T>::type)) {
+            problem = "a " + std::string(T::NAME);
+            return false;
+        }
+        value = reinterpret_cast<Held<T>*>(object)->object;
+        return true;
+    }
+};
+template <class T> struct Convert<std::unique_ptr<T>> {
+    static PyObject* to(std::unique_ptr<T>& made) {
+        auto* held = PyObject_New(Held<T>, Held<T>::type);
+        if (held) held->object = made.release();
+        return reinterpret_cast<PyObject*>(held);
+    }
+};
+
 // The name of argument k in a signature "function(first, second)\n--\n\n".
 inline std::string argument_name(const char* signature, size_t k) {
     const char* at = std::strchr(signature, '(') + 1;
@@ -239,9 +274,41 @@ template <auto F, bool BRIEF> PyMethodDef method(const char* name, const char* s
                 reinterpret_cast<void (*)()>(&Function<F, BRIEF>::call)),
             METH_FASTCALL, signature};
 }
+// The same for the method of a type: what it is called on is the first argument.
+template <auto F> struct Method;
+template <class R, class... Ts, R (*F)(Ts...)> struct Method<F> {
+    static PyObject* call(PyObject* self, PyObject* const* given, Py_ssize_t count) {
+        PyObject* all[sizeof...(Ts)] = {self};
+        if (count == static_cast<Py_ssize_t>(sizeof...(Ts)) - 1)
+            std::copy(given, given + count, all + 1);
+        return Function<F, true>::call(nullptr, all, count + 1);
+    }
+};
+template <auto F> PyMethodDef method_of_type(const char* name, const char* signature) {
+    Function<F, true>::signature = signature;
+    return {name,
+            reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(&Method<F>::call)),
+            METH_FASTCALL, signature};
+}
+// Adds the type of T to a module; its methods keep the interpreter's lock, so no two run at once.
+template <class T> bool add_type(PyObject* module, PyMethodDef* methods) {
+    PyType_Slot slots[] = {{Py_tp_dealloc, reinterpret_cast<void*>(&Held<T>::end)},
+                           {Py_tp_methods, methods},
+                           {0, nullptr}};
+    PyType_Spec spec{T::NAME, sizeof(Held<T>), 0,
+                     Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, slots};
+    PyObject* type = PyType_FromSpec(&spec);
+    Held<T>::type = reinterpret_cast<PyTypeObject*>(type);
+    const char* name = std::strrchr(T::NAME, '.');
+    Py_XINCREF(type);
+    return type && PyModule_AddObject(module, name ? name + 1 : T::NAME, type) == 0;
+}
+
 // Entries of a table of methods: a function of this namespace and the names of its arguments.
 // BRIEF keeps the interpreter's lock: for what takes less than 20 us.
 #define FUNCTION(function, arguments) \
     method<&function, false>(#function, #function "(" arguments ")\n--\n\n")
 #define BRIEF(function, arguments) \
     method<&function, true>(#function, #function "(" arguments ")\n--\n\n")
+#define METHOD(function, arguments) \
+    method_of_type<&function>(#function, #function "(" arguments ")\n--\n\n")

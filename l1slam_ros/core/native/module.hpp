@@ -17,10 +17,11 @@ namespace {
 struct Part {
     const char* name;
     PyMethodDef* methods;
+    bool (*add_types)(PyObject*) = nullptr;
 };
 const Part parts[] = {
     {"blocks", blocks::methods},
-    {"border", border::methods},
+    {"border", border::methods, border::add_types},
     {"cholesky", cholesky::methods},
     {"interior_point", interior_point::methods},
     {"ordering", ordering::methods},
@@ -62,7 +63,8 @@ PyMODINIT_FUNC JOIN(PyInit_, NAME)() {
     for (size_t p = 0; module && p < PARTS; p++) {
         definitions[p] = definition_of(parts[p].name, parts[p].methods);
         PyObject* part = PyModule_Create(&definitions[p]);
-        if (!part || PyModule_AddObject(module, parts[p].name, part) < 0) {
+        if (!part || (parts[p].add_types && !parts[p].add_types(part)) ||
+            PyModule_AddObject(module, parts[p].name, part) < 0) {
             Py_XDECREF(part);
             Py_CLEAR(module);
         }

@@ -9,6 +9,5 @@
 """What only a graph that grows needs; a graph that is solved once does without compiling it."""
 
 from l1slam_ros.core.kernels.growth.elimination import untouched
-from l1slam_ros.core.kernels.growth.points import move_children, pull_parents
 
-__all__ = ['move_children', 'pull_parents', 'untouched']
+__all__ = ['untouched']
