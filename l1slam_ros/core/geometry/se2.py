@@ -15,7 +15,7 @@ al., "A Tutorial on Graph-Based SLAM" (2010), sections IV and V, with the step o
 
 import numpy as np
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import kernels, native
 from l1slam_ros.core.geometry.manifold import Array
 
 NAME = 'SE2'
@@ -25,6 +25,8 @@ TRANSLATION = slice(0, 2)
 ROTATION = slice(2, 3)
 # Where x, y and yaw stand in the 6x6 covariance of a ROS message (x y z rx ry rz).
 COVARIANCE_ROWS: tuple[int, ...] = (0, 1, 5)
+# Of no more poses than that, as they come one by one, a call costs more than its sums.
+_FEW = 8
 
 
 def wrap(angle: Array) -> Array:
@@ -55,17 +57,23 @@ def identity(n: int) -> Array:
 
 def compose(a: Array, b: Array) -> Array:
     """Return a b, (n, 3)."""
+    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+        return native.poses.compose(a, b)
     x, y = _turned(a[..., 2], b[..., 0], b[..., 1])
     return _pose(a[..., 0] + x, a[..., 1] + y, a[..., 2] + b[..., 2])
 
 
 def inverse(a: Array) -> Array:
     """Return a^-1, (n, 3)."""
+    if a.ndim == 2 and len(a) <= _FEW:
+        return native.poses.inverse(a)
     return _pose(*_turned(-a[..., 2], -a[..., 0], -a[..., 1]), -a[..., 2])
 
 
 def between(a: Array, b: Array) -> Array:
     """Return a^-1 b, (n, 3)."""
+    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+        return native.poses.between(a, b)
     moved = _turned(-a[..., 2], b[..., 0] - a[..., 0], b[..., 1] - a[..., 1])
     return _pose(*moved, b[..., 2] - a[..., 2])
 
@@ -137,6 +145,8 @@ def interpolate(a: Array, b: Array, fraction: Array) -> Array:
 
 def motion(step: Array) -> tuple[Array, Array]:
     """Return the length [m] and the angle [rad] of each relative pose, (n,) and (n,)."""
+    if step.ndim == 2 and len(step) <= _FEW:
+        return native.poses.motion(step)
     return np.hypot(step[..., 0], step[..., 1]), np.abs(step[..., 2])
 
 

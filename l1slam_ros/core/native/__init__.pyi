@@ -4,7 +4,9 @@ from . import blocks as blocks
 from . import border as border
 from . import cholesky as cholesky
 from . import interior_point as interior_point
+from . import noise as noise
 from . import ordering as ordering
+from . import poses as poses
 from . import scans as scans
 from . import se2 as se2
 from . import se3 as se3

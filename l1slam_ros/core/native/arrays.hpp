@@ -116,6 +116,25 @@ template <class T, int N> struct Convert<Array<T, N>> {
     }
     static PyObject* to(const Array<T, N>& made) { return made.object; }
 };
+// Rows of doubles that are only read, wherever they lie: of what Python has cut or repeated.
+struct Rows {
+    const char* data = nullptr;
+    int64_t shape[2] = {}, step[2] = {};  // step : in bytes
+};
+template <> struct Convert<Rows> {
+    static bool from(PyObject* object, Rows& rows, std::string& problem) {
+        auto* array = reinterpret_cast<PyArrayObject*>(object);
+        if (!PyArray_Check(object) || PyArray_TYPE(array) != NPY_DOUBLE ||
+            PyArray_NDIM(array) != 2 || !PyArray_ISBEHAVED_RO(array)) {
+            problem = "a float64 array of 2 dimensions";
+            return false;
+        }
+        rows.data = static_cast<const char*>(PyArray_DATA(array));
+        for (int n = 0; n < 2; n++)
+            rows.shape[n] = PyArray_DIM(array, n), rows.step[n] = PyArray_STRIDE(array, n);
+        return true;
+    }
+};
 template <> struct Convert<double> {
     static bool from(PyObject* object, double& value, std::string& problem) {
         value = PyFloat_AsDouble(object);

@@ -26,8 +26,7 @@
 
 #include "arrays.hpp"
 #include "lanes.hpp"
-#include "se2.hpp"
-#include "se3.hpp"
+#include "poses.hpp"
 
 namespace border {
 
@@ -37,9 +36,8 @@ enum { L1, L2, MAPS };
 // So many new keyframes, the newest of some robots, have R at hand.
 constexpr size_t TIPS = 4;
 
-// Small dense matrices, (K, K) row by row.
-template <int K> using Square = std::array<double, K * K>;
-template <int K> using Few = std::array<double, K>;
+using poses::Few;
+using poses::Square;
 
 template <int K> Square<K> product(const Square<K>& a, const Square<K>& b) {
     Square<K> c{};
@@ -148,6 +146,64 @@ template <int K> INLINE void divide_by(const double* lines, int64_t stride, doub
     }
 }
 
+// K rows of numbers that grow at their ends.
+template <int K> struct Wide {
+    std::vector<double> data;
+    int64_t count = 0, stride = 0;
+
+    double* operator[](int64_t r) { return data.data() + r * stride; }
+    const double* operator[](int64_t r) const { return data.data() + r * stride; }
+    void resize(int64_t columns) {
+        if (columns > stride) {
+            const int64_t wider = std::max(columns, 2 * stride);
+            std::vector<double> moved(K * wider);
+            for (int r = 0; r < K; r++) std::copy_n((*this)[r], count, moved.data() + r * wider);
+            data.swap(moved);
+            stride = wider;
+        }
+        count = columns;
+    }
+};
+
+// Lines (K, stride) times rows of as many numbers, subtracted from (K, K).
+template <int K>
+INLINE void subtract_dots(const double* lines, int64_t stride, const Wide<K>& rows, int64_t count,
+                          Square<K>& from) {
+    constexpr int AT_ONCE = K == 3 ? 3 : 2;  // more would not fit into the registers
+    using Part = Lanes<WIDTH>;
+    for (int first = 0; first < K; first += AT_ONCE) {
+        Part sums[AT_ONCE][K];
+        UNROLL for (int a = 0; a < AT_ONCE; a++)
+            UNROLL for (int r = 0; r < K; r++) sums[a][r] = Part::zero();
+        int64_t c = 0;
+        for (; c + WIDTH <= count; c += WIDTH) {
+            Part x[K];
+            UNROLL for (int r = 0; r < K; r++) x[r] = Part::load(rows[r] + c);
+            UNROLL for (int a = 0; a < AT_ONCE; a++) {
+                Part line = Part::load(lines + (first + a) * stride + c);
+                UNROLL for (int r = 0; r < K; r++) sums[a][r].part[0] += line.part[0] * x[r].part[0];
+            }
+        }
+        for (int a = 0; a < AT_ONCE; a++)
+            for (int r = 0; r < K; r++) {
+                double total = 0.0;
+                for (int l = 0; l < WIDTH; l++) total += sums[a][r][l];
+                for (int64_t e = c; e < count; e++)
+                    total += lines[(first + a) * stride + e] * rows[r][e];
+                from[(first + a) * K + r] -= total;
+            }
+    }
+}
+
+// (K, K) divided by the lower triangle on its left.
+template <int K> void divide(const Square<K>& pivot, Square<K>& x) {
+    for (int a = 0; a < K; a++)
+        for (int r = 0; r < K; r++) {
+            for (int e = 0; e < a; e++) x[a * K + r] -= pivot[a * K + e] * x[e * K + r];
+            x[a * K + r] /= pivot[a * K + a];
+        }
+}
+
 // A sparse Cholesky factor in supernodes, as `cholesky` lays it out; Python owns the arrays.
 class Factor {
   public:
@@ -209,10 +265,10 @@ template <int K> class System {
         std::unique_ptr<double[]> rows;  // of F, (K, rows before)
         Square<K> pivot;
     };
-    // R of a new keyframe, (rows, WIDE).
+    // R' of a new keyframe, (K, rows).
     struct Tip {
         int64_t point;
-        std::vector<double> reduced;
+        Wide<K> reduced;
     };
 
   public:
@@ -256,15 +312,12 @@ template <int K> class System {
     Few<K> step(int64_t p, int side = 0) {
         Few<K> x{};
         if (p < 0) return x;
-        const double* R = reduced(p, side);
-        Row even = Row::zero(), odd = Row::zero();
-        int64_t c = 0, n = rows();
-        for (; c + 1 < n; c += 2) {
-            even.add(right[c], Row::load(R + c * WIDE));
-            odd.add(right[c + 1], Row::load(R + (c + 1) * WIDE));
+        const Wide<K>& R = reduced(p, side);
+        for (int r = 0; r < K; r++) {
+            double total = 0.0;
+            for (int64_t c = 0; c < R.count; c++) total += R[r][c] * right[c];
+            x[r] = point[p].mean[r] + total;
         }
-        if (c < n) even.add(right[c], Row::load(R + c * WIDE));
-        for (int r = 0; r < K; r++) x[r] = point[p].mean[r] + even[r] + odd[r];
         return x;
     }
 
@@ -319,16 +372,14 @@ template <int K> class System {
         std::fill_n(all.rows.get(), K * n, 0.0);
         for (int side = 0; side < 2; side++) {
             if (ends[side] < 0) continue;
-            const double* R = reduced(ends[side], side);
+            const Wide<K>& R = reduced(ends[side], side);
             const Square<K>& J = blocks[side];
-            for (int a = 0; a < K; a++) {
-                double* row = all.rows.get() + a * n;
-                for (int64_t c = 0; c < n; c++) {
-                    double total = 0.0;
-                    UNROLL for (int r = 0; r < K; r++) total += J[a * K + r] * R[c * WIDE + r];
-                    row[c] += total;
+            for (int a = 0; a < K; a++)
+                for (int r = 0; r < K; r++) {
+                    double* row = all.rows.get() + a * n;
+                    const double *from = R[r], entry = J[a * K + r];
+                    for (int64_t c = 0; c < n; c++) row[c] += entry * from[c];
                 }
-            }
             for (int other = 0; other < 2; other++) {
                 if (ends[other] < 0) continue;
                 Square<K> part = product<K>(product<K>(J, between(ends[side], ends[other])),
@@ -356,18 +407,16 @@ template <int K> class System {
         if (!root_of<K>(whole, one.pivot)) return false;
         for (Tip& tip : tips) {
             // Its covariance with the factor, less what the border has told of it.
-            Few<K> P[K] = {};
+            Square<K> X{};
             for (int side = 0; side < 2; side++) {
                 if (of.ends[side] < 0) continue;
                 Square<K> with = product<K>(of.blocks[side], between(of.ends[side], tip.point));
-                for (int a = 0; a < K; a++)
-                    for (int r = 0; r < K; r++) P[a][r] += with[a * K + r];
+                for (int k = 0; k < K * K; k++) X[k] += with[k];
             }
-            tip.reduced.resize((n + K) * WIDE);
-            double *R = tip.reduced.data(), *X = R + n * WIDE;
-            for (int a = 0; a < K; a++) std::copy(P[a].begin(), P[a].end(), X + a * WIDE);
-            subtract_products<K, K>(of.rows.get(), n, 0, n, R, X);
-            divide_by<K>(one.pivot.data(), K, X);
+            subtract_dots<K>(of.rows.get(), n, tip.reduced, n, X);
+            divide<K>(one.pivot, X);
+            tip.reduced.resize(n + K);
+            write(X, tip.reduced, n);
         }
         one.rows = std::move(of.rows);
         Few<K> to_right;
@@ -427,49 +476,56 @@ template <int K> class System {
         return nullptr;
     }
 
-    // R of a point, (rows, WIDE): at hand, or solved for.
-    const double* reduced(int64_t p, int side) {
-        if (Tip* tip = tip_of(p)) return tip->reduced.data();
-        std::vector<double>& to = spare[side];
-        if (solved[side] == p && int64_t(to.size()) == rows() * WIDE) return to.data();
+    static void write(const Square<K>& block, Wide<K>& R, int64_t at) {
+        for (int a = 0; a < K; a++)
+            for (int r = 0; r < K; r++) R[r][at + a] = block[a * K + r];
+    }
+
+    // R' of a point, (K, rows): at hand, or solved for.
+    const Wide<K>& reduced(int64_t p, int side) {
+        if (Tip* tip = tip_of(p)) return tip->reduced;
+        Wide<K>& R = spare[side];
+        if (solved[side] == p && R.count == rows()) return R;
         solved[side] = p;
-        to.assign(rows() * WIDE, 0.0);
-        double* X = to.data();
-        for (size_t f = 0; f < border.size(); f++, X += K * WIDE) {
+        R.resize(rows());
+        for (size_t f = 0; f < border.size(); f++) {
             const Appended& one = border[f];
+            const int64_t n = int64_t(f) * K;
+            Square<K> X{};
             for (int side = 0; side < 2; side++) {
                 if (one.ends[side] < 0) continue;
-                const Square<K> with = between(one.ends[side], p);
-                for (int a = 0; a < K; a++)
-                    for (int c = 0; c < K; c++)
-                        for (int r = 0; r < K; r++)
-                            X[a * WIDE + r] += one.blocks[side][a * K + c] * with[c * K + r];
+                Square<K> with = product<K>(one.blocks[side], between(one.ends[side], p));
+                for (int k = 0; k < K * K; k++) X[k] += with[k];
             }
-            subtract_products<K, K>(one.rows.get(), f * K, 0, f * K, to.data(), X);
-            divide_by<K>(one.pivot.data(), K, X);
+            subtract_dots<K>(one.rows.get(), n, R, n, X);
+            divide<K>(one.pivot, X);
+            write(X, R, n);
         }
-        return to.data();
+        return R;
     }
 
     // R of a new keyframe, that of its parent turned; the parent's is given up.
     void pass_on_tip(int64_t parent, int64_t p, const Square<K>& turn) {
-        Tip passed;
+        Tip passed{p, {}};
         if (Tip* tip = parent < 0 ? nullptr : tip_of(parent)) {
-            passed = std::move(*tip);
+            passed.reduced = std::move(tip->reduced);
             tips.erase(tips.begin() + (tip - tips.data()));
         } else if (parent >= 0) {
-            const double* R = reduced(parent, 0);
-            passed.reduced.assign(R, R + rows() * WIDE);
+            passed.reduced = reduced(parent, 0);
         } else {
-            passed.reduced.assign(rows() * WIDE, 0.0);
+            passed.reduced.resize(rows());  // zeros
         }
-        passed.point = p;
-        for (int64_t c = 0; parent >= 0 && c < rows(); c++) {
-            double* row = passed.reduced.data() + c * WIDE;
-            Few<K> before;
-            std::copy_n(row, K, before.begin());
-            Few<K> after = product<K>(turn, before);
-            std::copy(after.begin(), after.end(), row);
+        Wide<K>& R = passed.reduced;
+        double* row[K];
+        for (int r = 0; r < K; r++) row[r] = R[r];
+        for (int64_t c = 0; parent >= 0 && c < R.count; c++) {
+            double before[K];
+            for (int r = 0; r < K; r++) before[r] = row[r][c];
+            for (int r = 0; r < K; r++) {
+                double total = 0.0;
+                for (int e = 0; e < K; e++) total += turn[r * K + e] * before[e];
+                row[r][c] = total;
+            }
         }
         if (tips.size() == TIPS) tips.erase(tips.begin());
         tips.push_back(std::move(passed));
@@ -519,7 +575,7 @@ template <int K> class System {
     std::vector<Few<K>> gradient;
     int64_t known_pulls = 0;
     // R of the ends of a factor, and of which points they are.
-    std::vector<double> spare[2];
+    Wide<K> spare[2];
     int64_t solved[2] = {FIXED, FIXED};
     // In the values on the way of a point: the place of a position, how much of the way is left
     // from a supernode on, 0: it is not on it.
@@ -674,95 +730,6 @@ template <int K> void System<K>::descend() {
         }
     }
 }
-
-// Poses x, y, theta of the plane.
-struct Plane {
-    static constexpr int P = 3, K = 3;
-    static void identity(double* pose) { pose[0] = pose[1] = pose[2] = 0.0; }
-    static void compose(const double* a, const double* b, double* ab) {
-        double c = std::cos(a[2]), s = std::sin(a[2]);
-        double x = a[0] + (c * b[0] - s * b[1]), y = a[1] + (s * b[0] + c * b[1]);
-        ab[2] = se2::wrapped(a[2] + b[2]);
-        ab[0] = x, ab[1] = y;
-    }
-    static void retract(const double* pose, const Few<K>& step, double* to) {
-        compose(pose, step.data(), to);
-    }
-    static void inverse(const double* a, double* to) {
-        double c = std::cos(a[2]), s = std::sin(a[2]);
-        to[0] = -c * a[0] - s * a[1], to[1] = s * a[0] - c * a[1];
-        to[2] = se2::wrapped(-a[2]);
-    }
-    static Few<K> residual(const double* z, const double* i, const double* j) {
-        double c = std::cos(z[2]), s = std::sin(z[2]);
-        se2::Seen t(i, j, std::cos(i[2]), std::sin(i[2]));
-        return {c * (t.x - z[0]) + s * (t.y - z[1]), c * (t.y - z[1]) - s * (t.x - z[0]),
-                se2::wrapped(j[2] - i[2] - z[2])};
-    }
-    static void jacobians(const double* z, const double* i, const double* j, Square<K> (&J)[2]) {
-        double c = std::cos(z[2]), s = std::sin(z[2]), phi = j[2] - i[2] - z[2];
-        se2::Seen t(i, j, std::cos(i[2]), std::sin(i[2]));
-        J[0] = {-c, -s, c * t.y - s * t.x, s, -c, -s * t.y - c * t.x, 0, 0, -1};
-        J[1] = {std::cos(phi), -std::sin(phi), 0, std::sin(phi), std::cos(phi), 0, 0, 0, 1};
-    }
-};
-
-// Poses x, y, z, qx, qy, qz, qw of space.
-struct Space {
-    static constexpr int P = 7, K = 6;
-    static void identity(double* pose) { std::fill_n(pose, 6, 0.0), pose[6] = 1.0; }
-    static se3::Quaternion opposite(se3::Quaternion q) { return {-q.x, -q.y, -q.z, q.w}; }
-    static void set(double* to, se3::Point t, se3::Quaternion q) {
-        double square = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w;
-        // What was normalised once stays as it is.
-        bool is_unit = std::abs(square - 1) <= 4 * std::numeric_limits<double>::epsilon();
-        double scale = (is_unit ? 1.0 : 1 / std::sqrt(square)) * (q.w < 0 ? -1 : 1);
-        const double pose[7] = {t.x, t.y, t.z, scale * q.x, scale * q.y, scale * q.z, scale * q.w};
-        std::copy(pose, pose + 7, to);
-    }
-    static void move(const double* a, se3::Point step, se3::Quaternion turn, double* to) {
-        se3::Quaternion back = opposite(se3::turn_of(a));
-        se3::Point t = se3::turned_back(back, step);
-        set(to, {a[0] + t.x, a[1] + t.y, a[2] + t.z}, se3::product(back, turn));
-    }
-    static void compose(const double* a, const double* b, double* ab) {
-        move(a, {b[0], b[1], b[2]}, se3::turn_of(b), ab);
-    }
-    static void retract(const double* pose, const Few<K>& step, double* to) {
-        double half = std::sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5]) / 2;
-        double share = (half > 0 ? std::sin(half) / half : 1.0) / 2;
-        move(pose, {step[0], step[1], step[2]},
-             {share * step[3], share * step[4], share * step[5], std::cos(half)}, to);
-    }
-    static void inverse(const double* a, double* to) {
-        se3::Quaternion q = se3::turn_of(a);
-        se3::Point t = se3::turned_back(q, {-a[0], -a[1], -a[2]});
-        set(to, t, opposite(q));
-    }
-    static Few<K> residual(const double* z, const double* i, const double* j) {
-        se3::Seen at(z, i, j);
-        auto t = se3::turned_back(se3::turn_of(z), {at.p.x - z[0], at.p.y - z[1], at.p.z - z[2]});
-        return {t.x, t.y, t.z, 2 * at.q.x, 2 * at.q.y, 2 * at.q.z};
-    }
-    static void jacobians(const double* z, const double* i, const double* j, Square<K> (&J)[2]) {
-        se3::Seen at(z, i, j);
-        se3::Square R_z = se3::Square::of(se3::turn_of(z)), R_ij = se3::Square::of(at.q_ij);
-        se3::Square M = se3::Square::skew({at.q.x, at.q.y, at.q.z}, at.q.w);
-        const double p[3] = {at.p.x, at.p.y, at.p.z};
-        J[0] = J[1] = {};
-        for (int r = 0; r < 3; r++)
-            for (int c = 0; c < 3; c++) {
-                int a = (c + 1) % 3, b = (c + 2) % 3;
-                J[0][r * 6 + c] = -R_z.m[c][r];
-                J[0][r * 6 + 3 + c] = R_z.m[a][r] * p[b] - R_z.m[b][r] * p[a];
-                J[1][(3 + r) * 6 + 3 + c] = M.m[r][c];
-                for (int k = 0; k < 3; k++) {
-                    J[1][r * 6 + c] += R_z.m[k][r] * R_ij.m[k][c];
-                    J[0][(3 + r) * 6 + 3 + c] -= M.m[r][k] * R_ij.m[c][k];
-                }
-            }
-    }
-};
 
 // Both maps of a front, and the factors that it has taken.
 class Front {
@@ -1017,11 +984,11 @@ inline std::unique_ptr<Front> front(
     require(l1.size() == l2.size() && l1.shape[1] == l2.shape[1], "l1 and l2 of one shape (n, p)");
     require(fixed >= 0 && of_l1->size() == l1.size() - fixed && of_l2->size() == of_l1->size(),
             "factors of all keyframes but the fixed ones");
-    require(l1.shape[1] == Plane::P || l1.shape[1] == Space::P, "poses of the plane or of space");
-    if (l1.shape[1] == Plane::P)
-        return std::make_unique<FrontOf<Plane>>(l1, l2, fixed, usual, mu, of_odometry, of_loops,
+    require(l1.shape[1] == poses::Plane::P || l1.shape[1] == poses::Space::P, "poses of the plane or of space");
+    if (l1.shape[1] == poses::Plane::P)
+        return std::make_unique<FrontOf<poses::Plane>>(l1, l2, fixed, usual, mu, of_odometry, of_loops,
                                                 longest, std::move(of_l1), std::move(of_l2));
-    return std::make_unique<FrontOf<Space>>(l1, l2, fixed, usual, mu, of_odometry, of_loops,
+    return std::make_unique<FrontOf<poses::Space>>(l1, l2, fixed, usual, mu, of_odometry, of_loops,
                                             longest, std::move(of_l1), std::move(of_l2));
 }
 

@@ -5,7 +5,9 @@
 #include "border.hpp"
 #include "cholesky.hpp"
 #include "interior_point.hpp"
+#include "noise.hpp"
 #include "ordering.hpp"
+#include "poses.hpp"
 #include "scans.hpp"
 #include "se2.hpp"
 #include "se3.hpp"
@@ -24,7 +26,9 @@ const Part parts[] = {
     {"border", border::methods, border::add_types},
     {"cholesky", cholesky::methods},
     {"interior_point", interior_point::methods},
+    {"noise", noise::methods},
     {"ordering", ordering::methods},
+    {"poses", poses::methods},
     {"scans", scans::methods},
     {"se2", se2::methods},
     {"se3", se3::methods},

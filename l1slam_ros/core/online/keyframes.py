@@ -13,6 +13,7 @@ In: the relative pose of each odometry message to the one before. Out: whether a
 and the motion since the last keyframe with its covariance.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -230,8 +231,8 @@ class KeyframeMotion:
         self.bounded = []
         model = diagonal_covariance(
             self._manifold,
-            float(np.hypot(options.sigma_translation * self._metres, options.floor_translation)),
-            float(np.hypot(options.sigma_rotation * self._radians, options.floor_rotation)))
+            math.hypot(options.sigma_translation * self._metres, options.floor_translation),
+            math.hypot(options.sigma_rotation * self._radians, options.floor_rotation))
         stated = self._sum(model, verbatim) if self._stated else None
         return (model if stated is None else stated) + self._unseen
 
@@ -254,7 +255,7 @@ class KeyframeMotion:
         stated = np.array(self._stated)
         if not noise.usable(noise.without_unset(stated)).all():
             return None
-        if len(stated) == 1:
+        if len(stated) == 1:  # as of most keyframes that are messages
             return stated
         Ad = manifold.adjoint(manifold.between(end, np.concatenate(self._poses)))
         return Ad @ stated @ Ad.transpose(0, 2, 1)

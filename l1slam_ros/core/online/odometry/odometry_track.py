@@ -153,11 +153,11 @@ class OdometryTrack:
             self.begin_part(stamp)
         elif any(reach) and self._parts.view()[-1, 0] < len(self):
             self._silences.add(self.last, stamp + self._shifts[-1][1], reach, True)
-        self._times.extend(np.array([stamp + self._shifts[-1][1]]))
-        self._poses.extend(pose)
+        self._times.append(stamp + self._shifts[-1][1])
+        self._poses.append(pose[0])
         if is_keyframe:
-            self._keyframes.extend(np.array([len(self) - 1]))
-            self._keyframe_stamps.extend(np.array([stamp]))
+            self._keyframes.append(len(self) - 1)
+            self._keyframe_stamps.append(stamp)
 
     def went_by(self, stamp: int, pose: Array) -> Array | None:
         """
