@@ -225,6 +225,64 @@ inline std::tuple<Vector<double>, Vector<double>> motion(Rows step) {
     return {length, angle};
 }
 
+// x, y and the yaw of poses (n, 7).
+inline Matrix<double> onto_plane(Rows pose3) {
+    require(pose3.shape[1] == Space::P, "poses (n, 7)");
+    auto made = new_array<double, 2>({pose3.shape[0], Plane::P});
+    for (int64_t n = 0; n < pose3.shape[0]; n++) {
+        auto p = row_of<Space::P>(pose3, n);
+        made(n, 0) = p[0], made(n, 1) = p[1];
+        made(n, 2) = std::atan2(2 * (p[6] * p[5] + p[3] * p[4]),
+                                p[6] * p[6] + p[3] * p[3] - p[4] * p[4] - p[5] * p[5]);
+    }
+    return made;
+}
+
+// How many of the times, ascending, are before each that is asked for; to : or equal to it. What
+// NumPy calls searchsorted lets go of the interpreter's lock each time.
+inline Vector<int64_t> places(Vector<const int64_t> times, Vector<const int64_t> asked, bool to) {
+    auto found = new_vector<int64_t>(asked.size());
+    const int64_t *begin = times.data, *end = begin + times.size();
+    for (int64_t k = 0; k < asked.size(); k++)
+        found[k] = (to ? std::upper_bound(begin, end, asked[k])
+                       : std::lower_bound(begin, end, asked[k])) - begin;
+    return found;
+}
+
+template <class G>
+Matrix<double> interpolate_of(Vector<const int64_t> times, Matrix<const double> poses,
+                              Vector<const int64_t> first, Vector<const int64_t> end,
+                              Vector<const int64_t> asked) {
+    auto found = new_array<double, 2>({asked.size(), G::P});
+    for (int64_t k = 0; k < asked.size(); k++) {
+        const int64_t from = first[first.size() == 1 ? 0 : k], to = end[end.size() == 1 ? 0 : k];
+        require(from >= 0 && from < to && to <= times.size(), "first and end of parts of times");
+        int64_t after = std::lower_bound(times.data, times.data + times.size(), asked[k]) -
+                        times.data;
+        after = std::min(std::max(after, std::min(from + 1, to - 1)), to - 1);
+        const int64_t before = std::max(after - 1, from);
+        const double span = double(std::max<int64_t>(times[after] - times[before], 1));
+        const double fraction = std::min(double(asked[k] - times[before]) / span, 1.0);
+        std::array<double, G::P> seen;
+        G::between(poses[before], poses[after], seen.data());
+        Few<G::K> step = G::step_to(seen.data());
+        for (double& entry : step) entry *= fraction;
+        G::retract(poses[before], step, found[k]);
+    }
+    return found;
+}
+// Poses at the times asked for, between samples at `times`, ascending, of a part each.
+inline Matrix<double> interpolate(Vector<const int64_t> times, Matrix<const double> poses,
+                                  Vector<const int64_t> first, Vector<const int64_t> end,
+                                  Vector<const int64_t> asked) {
+    require(poses.shape[1] == Plane::P || poses.shape[1] == Space::P, "poses (n, 3) or (n, 7)");
+    require(poses.size() == times.size(), "as many poses as times");
+    require((first.size() == 1 || first.size() == asked.size()) &&
+                (end.size() == 1 || end.size() == asked.size()),
+            "first and end of all, or of each asked for");
+    return OF_GROUP(poses.shape[1], interpolate_of, times, poses, first, end, asked);
+}
+
 static PyMethodDef methods[] = {
     BRIEF(compose, "a, b"),
     BRIEF(between, "a, b"),
@@ -232,6 +290,9 @@ static PyMethodDef methods[] = {
     BRIEF(retract, "pose, step"),
     BRIEF(local, "a, b"),
     BRIEF(motion, "step"),
+    BRIEF(onto_plane, "pose3"),
+    BRIEF(places, "times, asked, to"),
+    BRIEF(interpolate, "times, poses, first, end, asked"),
     {}};
 
 }  // namespace poses

@@ -5,7 +5,7 @@ Poses are rows (n, 3) or (n, 7), steps (n, 3) or (n, 6) [m, rad], as `se2` and `
 argument with one row goes with all rows of the other.
 """
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 
 def compose(a: Array, b: Array) -> Array:
     """Return a b, (n, p)."""
@@ -24,3 +24,19 @@ def local(a: Array, b: Array) -> Array:
 
 def motion(step: Array) -> tuple[Array, Array]:
     """Return the length [m] and the angle [rad] of each step, (n,) and (n,)."""
+
+def onto_plane(pose3: Array) -> Array:
+    """Return x, y and the yaw of poses (n, 7), (n, 3)."""
+
+def places(times: Indices, asked: Indices, to: bool) -> Indices:
+    """Return how many times (n,), ascending, are before each asked for, (m,); to : or equal."""
+
+def interpolate(
+    times: Indices, poses: Array, first: Indices, end: Indices, asked: Indices
+) -> Array:
+    """
+    Return poses at the times asked for, (m, p), along straight lines and even turns.
+
+    times (n,) ascending, poses (n, p) : samples; first, end : of the samples among which each is
+    to be, (m,) or (1,)
+    """

@@ -73,8 +73,13 @@ def diagonal_covariance(manifold: Manifold, translation: float, rotation: float)
 
 def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:
     """Return the rows of messages' (..., 6, 6) covariances that the manifold has, (..., d, d)."""
-    rows = np.array(manifold.COVARIANCE_ROWS)
-    return covariance[..., rows[:, None], rows]
+    rows = manifold.COVARIANCE_ROWS
+    reduced = np.empty((*covariance.shape[:-2], len(rows), len(rows)))
+    # One by one: `covariance[..., rows[:, None], rows]` lets go of the interpreter's lock.
+    for r, row in enumerate(rows):
+        for c, column in enumerate(rows):
+            reduced[..., r, c] = covariance[..., row, column]
+    return reduced
 
 
 class Level:
@@ -90,8 +95,13 @@ class Level:
 
         Zeros, where that would not make a keyframe: a floor is not quite even.
         """
+        if self._manifold is se3:
+            return 0.0, 0.0
         pose3 = sample.pose3[None]
-        off = se3.local(self._manifold.to_pose3(self._manifold.from_pose3(pose3)), pose3)
+        _, _, z, qx, qy, *_ = sample.pose3.tolist()
+        # Most odometry only has a height to drop.
+        off = (np.array([[0.0, 0.0, z, 0.0, 0.0, 0.0]]) if qx == qy == 0.0 else
+               se3.local(self._manifold.to_pose3(self._manifold.from_pose3(pose3)), pose3))
         if self._first is None:
             self._first = off
         (length,), (angle,) = se3.motion(off - self._first)
