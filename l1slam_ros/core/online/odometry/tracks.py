@@ -131,7 +131,7 @@ class Ends:
                 kind: type = float) -> Any:
         """Return what tracks say, one after the other, each of its rows."""
         if len(self._groups) == 1:  # as of most
-            values = np.asarray(of(*self._groups[0]), kind)
+            values: Any = np.asarray(of(*self._groups[0]), kind)
             return values if values.ndim else np.full(self._count, values)
         said: Any = None
         for track, rows in self._groups:
