@@ -41,7 +41,7 @@ from l1slam_ros.io.progress import Progress
 SPARSE: tuple[str, ...] = ()
 JUDGEMENT: tuple[str, ...] = ()
 DENSE: tuple[str, ...] = ()
-ONLINE = ('border', 'growth.points')
+ONLINE: tuple[str, ...] = ()
 # Modules of `core` for matching scans.
 SCANS = ('scans.kernels', 'scans.search_kernels')
 STEPS = (*ONLINE, *SPARSE)

@@ -35,7 +35,6 @@ from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import GraphMarkers
 from l1slam_ros.ros.parameters import NodeParameters
 from l1slam_ros.ros.robot import RobotPublisher
-from l1slam_ros.ros.threads.background import background
 from l1slam_ros.ros.threads.failures import Failures
 
 # Number of keyframes from which a map is large: some 10 ms to publish. Its thread rests for
@@ -88,7 +87,8 @@ class MapPublisher:
         if improvement is not None:
             self._diagnostics.note(improvement)
         if self._thread is None and self._keyframes > _LARGE:
-            self._thread = background('path', self._keep_publishing)
+            self._thread = threading.Thread(
+                target=self._keep_publishing, name='path', daemon=True)
             self._thread.start()
         if self._thread is None:
             self._publish_news()

@@ -11,7 +11,8 @@ Innovation gating (NIS) of new factors, on a map that they move at once.
 
 In: a map, the factors that it is of, and factors as they come. Out: which of them to believe, and
 where all keyframes are. An update costs what has come since the map was factored, whatever the
-size of the map: see `bordered_system`.
+size of the map: the factored normal matrix is bordered by the later factors, row by row, in
+`native/border.hpp`.
 
 Two systems are kept, of two maps. In the least squares map the innovation of a true factor has a
 known distribution: that is the gate. The other one has the weights 1 / sqrt(e^2 + mu^2), with
@@ -23,26 +24,26 @@ they are: with Jacobians at poses that have moved since, a map turns for which n
 estimators", 2010).
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from l1slam_ros.core.bordered.bordered_system import BorderedSystem, Prediction, Steps
-from l1slam_ros.core.bordered.linearised import Linearised, Pair, in_order
-from l1slam_ros.core.bordered.points import FIXED
+from l1slam_ros.core import native
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
-from l1slam_ros.core.graph.growable_array import GrowingArray, few_rows
 from l1slam_ros.core.graph.linear_system import anchor, linearise
 from l1slam_ros.core.robust.innovation import chi2_quantile, claimed_volume
 from l1slam_ros.core.robust.odometry.drift import corrected
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.optimality import smoothing
 
-# The two maps.
+# The two maps, as `native.border` numbers them.
 L1, L2 = 0, 1
+# In the place of a keyframe: what the map is held by.
+_HELD = -1
 # mu, where the weights of the L1 map turn over, in mean |e|.
 _SMOOTHING = 0.1
 # One in so many true loops may be left to the judge for its noise alone.
@@ -52,6 +53,9 @@ _SURE = 1000.0
 # Rows of a border, and keyframes it touches, that one more update has the time and the memory for.
 # What comes then waits for the next map.
 MOST_ROWS, _MOST_POINTS = 1800, 1400
+# So many keyframes of a path to the root of the elimination tree have their columns of L^-1 kept:
+# 70 kB in the plane.
+_LONGEST = 1024
 # What to do with a factor: accept it; skip it, since the map has it or shall not have it; gate it.
 BELIEVE = 1
 SKIP = 0
@@ -69,6 +73,9 @@ class Look:
 
 # The look at a factor that was skipped.
 _SKIPPED = Look(False, False, np.nan)
+# The first factor of a keyframe; a factor that no front can gate.
+_FIRST = Look(True, False, 0.0)
+_LEFT_TO_THE_JUDGE = Look(False, True, np.nan)
 
 
 @dataclass(frozen=True)
@@ -76,19 +83,37 @@ class View:
     """
     One of the maps at one moment, to be worked out at leisure.
 
-    first : (n, p) where the keyframes began; fixed : so many are held fixed; steps : of the others
+    first : (n, p) where the keyframes of H began; fixed : so many are held fixed; cholesky : holds
+    the factor of H; pulled, pull : (o,) keyframes of H, behind the fixed ones, and (o, k) what
+    pulls at them; parent (b,), turn (b, k, k), shift (b, k), began (b, p) : of the new keyframes
     """
 
     manifold: Manifold
     first: Array
     fixed: int
-    steps: Steps
+    cholesky: BlockCholesky
+    pulled: Indices
+    pull: Array
+    parent: Indices
+    turn: Array
+    shift: Array
+    began: Array
 
     @cached_property
     def poses(self) -> Array:
-        """All keyframes, (n, p)."""
-        moved = self.manifold.retract(self.first[self.fixed:], self.steps.all())
-        return np.concatenate((self.first[:self.fixed], moved))
+        """All keyframes, (n + b, p)."""
+        free, new = len(self.first) - self.fixed, len(self.parent)
+        steps = np.zeros((free + new, self.manifold.TANGENT_SIZE))
+        # 1. Of the keyframes of H: H^-1 times what the factors of the border pull at them.
+        if len(self.pulled):
+            steps[self.pulled] = self.pull
+            steps[:free] = self.cholesky.solve(steps[:free].ravel()).reshape(free, -1)
+        # 2. Of the new ones: each follows what it hangs on.
+        native.border.hang(self.parent, self.turn, self.shift, steps)
+        # 3. Steps move the poses at which all was linearised.
+        first = np.concatenate((self.first, self.began))
+        moved = self.manifold.retract(first[self.fixed:], steps)
+        return np.concatenate((first[:self.fixed], moved))
 
 
 class Front:
@@ -135,43 +160,43 @@ class Front:
         self._limit = float(chi2_quantile(1 - _REFUSED, np.array([k]))[0])
         self._volume = (float(claimed_volume(part.manifold, poses[L1]).sum())
                         - k * np.log(2 * np.pi) / 2 - np.log(_SURE - 1) - log_odds)
-        self._variance = np.repeat(variance[:, None], k, axis=1)
-        self._mu = _SMOOTHING * smoothing(system.b)
-        weights = 1 / np.hypot(system.b, self._mu)
+        mu = _SMOOTHING * smoothing(system.b)
+        weights = 1 / np.hypot(system.b, mu)
         if not choleskys[L1].factorise(system, weights):
             raise GraphError('a part of the graph is not tied to the anchor')
         # The weight of a new factor in the L1 map hangs on the residual that those to come will
         # leave of it. Till then: of the first factor of a keyframe the mean of all weights and of
         # one without a residual; of a loop the geometric mean of that and of its own.
-        self._usual = np.full(k, 1 / np.append(weights, 1 / self._mu).mean())
-        self._systems = [BorderedSystem(cholesky, system.size, k, _MOST_POINTS, MOST_ROWS)
-                         for cholesky in choleskys]
-        self._first = GrowingArray((2, part.manifold.POSE_SIZE))
-        self._first.extend(np.stack(poses, axis=1))
+        usual = 1 / np.append(weights, 1 / mu).mean()
+        self._choleskys = choleskys
+        self._first = [np.ascontiguousarray(of_one) for of_one in poses]
+        of_odometry, of_loops = variance.tolist()
+        self._border = native.border.front(
+            self._first[L1], self._first[L2], self._fixed, usual, mu, of_odometry, of_loops,
+            _LONGEST, *choleskys[L1].factor, *choleskys[L2].factor)
 
     @property
     def keyframes(self) -> int:
         """How many keyframes it knows."""
-        # What a factor that failed wanted to see does not count.
-        return self._fixed + self._systems[L1].keyframes
+        return self._border.keyframes()
 
     @property
     def border(self) -> int:
         """How many rows the bordered system has."""
-        return self._systems[L1].rows
+        return self._border.rows()
 
     @property
     def views(self) -> tuple[View, View]:
         """The L1 and the L2 map as they are now."""
-        first = self._first.view()[:self.keyframes]
-        return (View(self._manifold, first[:, L1], self._fixed, self._systems[L1].steps()),
-                View(self._manifold, first[:, L2], self._fixed, self._systems[L2].steps()))
+        return self._view(L1), self._view(L2)
+
+    def _view(self, of: int) -> View:
+        return View(self._manifold, self._first[of], self._fixed, self._choleskys[of],
+                    *self._border.moment(of))
 
     def poses_of(self, keyframes: Indices) -> Array:
         """Return the L1 poses of some keyframes that it knows, (m, p)."""
-        steps = self._systems[L1].step(list(map(self._end, keyframes.tolist())))
-        first = few_rows(self._first.view(), keyframes)[:, L1]
-        return self._manifold.retract(first, steps)
+        return self._border.poses(L1, keyframes)
 
     def covariance(self, keyframe: int, seen_from: int | None = None) -> Array:
         """
@@ -179,166 +204,64 @@ class Front:
 
         seen_from : relative to this keyframe, None: to what the map is held by
         """
-        turn = np.zeros((len(self._usual),) * 2)
-        other = FIXED
-        if seen_from is not None:
-            here, there = self.poses_of(np.array([keyframe, seen_from]))[:, None]
-            turn = self._manifold.adjoint(self._manifold.between(here, there))[0]
-            other = self._end(seen_from)
-        return self._systems[L2].covariance(self._end(keyframe), other, turn)
+        k = self._manifold.TANGENT_SIZE
+        if seen_from is None:
+            return self._border.covariance(keyframe, _HELD, np.zeros((k, k)))
+        here, there = self.poses_of(np.array([keyframe, seen_from]))[:, None]
+        turn = self._manifold.adjoint(self._manifold.between(here, there))[0]
+        return self._border.covariance(keyframe, seen_from, turn)
 
     def take(self, factors: BetweenFactors, what: Indices) -> list[Look]:
         """
         Take the next factors, from row `rows` on; return what the gate says of those it took.
 
-        what : to do with each, `BELIEVE`, `SKIP` or `GATE`, a few at a time. It returns looks at
-        fewer where the next one is beyond it: it takes no more then
+        what : to do with each, `BELIEVE`, `SKIP` or `GATE`. It returns looks at fewer where the
+        next one is beyond it: it takes no more then
         """
         looks: list[Look] = []
-        wanted = what.tolist()
-        rows = range(self.rows, self.rows + len(wanted))
-        asked = [row for row, one in zip(rows, wanted, strict=True) if one != SKIP]
-        if not asked:
-            self.rows += len(wanted)
-            return len(wanted) * [_SKIPPED]
-        pairs = list(zip(factors.i[rows.start:rows.stop].tolist(),
-                         factors.j[rows.start:rows.stop].tolist(), strict=True))
-        first = asked[0] - rows.start
-        self.closed = self._is_beyond(pairs[first], wanted[first])
-        if self.closed:
-            return looks
-        # Only these: each keyframe that is touched makes the next one cost more.
-        before = [system.points for system in self._systems]
-        linearised = self._linearise(factors, asked, [pairs[row - rows.start] for row in asked])
-        at = 0
-        for pair, one in zip(pairs, wanted, strict=True):
-            if one == SKIP:
-                look: Look | None = _SKIPPED
-            elif self._is_beyond(pair, one):
-                look = None
-            else:
-                look = self._look(factors, linearised, at, pair, one)
-                at += 1
+        rows = slice(self.rows, self.rows + len(what))
+        for i, j, one in zip(factors.i[rows].tolist(), factors.j[rows].tolist(), what.tolist(),
+                             strict=True):
+            look = self._look(factors, i, j, one)
             if look is None:
                 self.closed = True
                 break
             self.rows += 1
             self.taken += one != SKIP
             looks.append(look)
-        for system, points in zip(self._systems, before, strict=True):
-            system.forget_unused(points)
         return looks
 
-    def _is_beyond(self, pair: Pair, what: int) -> bool:
-        """Tell whether a factor must wait for the next map."""
-        return (max(pair) > self.keyframes or (what == BELIEVE and self._turns(pair))
-                or self.border > MOST_ROWS or self._systems[L2].points > _MOST_POINTS)
-
-    def _turns(self, pair: Pair) -> bool:
-        """Tell whether a factor is the first that names the world: the gauge is another."""
-        return pair[0] == WORLD and self._fixed > 0
-
-    def _look(self, factors: BetweenFactors, new: Linearised, at: int, pair: Pair,
-              what: int) -> Look | None:
-        """Gate a factor, and make it part of the map where it is accepted; None: it cannot be."""
-        own = factors.sqrt_information[self.rows].diagonal()
-        # A factor that leaves a component unsaid is left to the judge.
-        if what == GATE and (self._turns(pair) or not own.all()):
-            return Look(False, True, np.nan)
-        first_seen = self.keyframes in pair
-        l1, l2 = self._systems
-        try:
-            if first_seen:
-                l2.begin(*new.of(L2, at), self._variance[0])
-                l1.begin(*new.of(L1, at), self._usual)
-                return Look(True, False, 0.0)
-            variance = self._variance[1]
-            predicted = l2.predict(*new.of(L2, at))
-            look, left = self._gate(predicted, own, variance, what == BELIEVE)
-            if look.accepted:
-                l2.add(predicted, variance)
-                noise = np.sqrt(self._usual * np.hypot(left, self._mu))
-                l1.add(l1.predict(*new.of(L1, at)), noise)
-        except np.linalg.LinAlgError:
-            # Beyond double precision here; the next map may be able to take it.
+    def _look(self, factors: BetweenFactors, i: int, j: int, what: int) -> Look | None:
+        """Gate the next factor, from keyframe i to j; None: it must wait for the next map."""
+        # 1. What the map has, or shall not have.
+        if what == SKIP:
+            return _SKIPPED
+        # 2. Beyond the front: a keyframe that it skipped, another gauge, no time or memory left.
+        border = self._border
+        known = border.keyframes()
+        turns = i == WORLD and self._fixed > 0
+        if (max(i, j) > known or (what == BELIEVE and turns) or border.rows() > MOST_ROWS
+                or border.points() > _MOST_POINTS):
             return None
-        return look
-
-    def _gate(self, predicted: Prediction, own: Array, variance: Array,
-              sure: bool) -> tuple[Look, Array]:
-        """
-        Return what the innovation of a loop says, and its residual once it is accepted, (k,).
-
-        own : diagonal of the root of its information; variance : of its noise, (k,); sure : it is
-        accepted whatever the gate says. The NIS has to be below the limit of chi2, and the log
-        ratio of a true loop to a false one, anywhere on the map, above 0.
-        """
-        covariance = predicted.covariance + np.diag(variance)
-        whitened = np.linalg.solve(covariance, predicted.residual)
-        nis = float(predicted.residual @ whitened)
-        left = variance * whitened
-        sigmas = float(np.sqrt(left @ (left / variance)))
-        if sure:
-            return Look(True, False, sigmas), left
-        log_ratio = float(self._volume + np.log(own).sum() - nis / 2
-                          - np.linalg.slogdet(covariance)[1] / 2)
-        fits = nis < self._limit
-        accepted = fits and log_ratio > 0
-        return Look(accepted, fits and not accepted,
-                    sigmas if accepted else float(np.sqrt(nis))), left
-
-    def _linearise(self, factors: BetweenFactors, asked: list[int],
-                   pairs: list[Pair]) -> Linearised:
-        """
-        Return factors as the bordered systems want them, up to the first that is beyond them.
-
-        A keyframe that a factor sees for the first time is put where it says; keyframes have to
-        be seen in the order of their indices, so a factor that skips one is beyond.
-        """
-        manifold = self._manifold
-        pairs = pairs[:in_order(pairs, len(self._first))]
-        rows = np.array(asked[:len(pairs)])
-        Z, root = few_rows(factors.measurement, rows), few_rows(factors.sqrt_information, rows)
-        if self._drift:
-            odometry = factors.is_odometry[rows]
-            Z[odometry] = corrected(factors, rows[odometry], self._drift)
-        self._put_new(pairs, Z)
-        first, steps, poses = self._moved([*(i for i, _ in pairs), *(j for _, j in pairs)])
-        p, k = first.shape[2], steps.shape[2]
-        # Of each factor in both maps: Jacobians at the first poses, residuals at those of now.
-        Z = np.repeat(Z, 2, axis=0)
-        root = root[:, None]
-        J = manifold.residual_jacobians(Z, *first.reshape(2, -1, p)).reshape(-1, 2, 2, k, k)
-        e = manifold.residual(Z, *poses.reshape(2, -1, p)).reshape(-1, 2, k)
-        blocks = root[:, None] @ J
-        whitened = (root @ e[..., None])[..., 0]
-        # As it would be at no step: r + J x is e then at the step there is.
-        steps = steps.reshape(2, -1, 2, k).transpose(1, 2, 0, 3)
-        residual = whitened - (blocks @ steps[..., None])[..., 0].sum(axis=2)
-        return Linearised([(self._end(i), self._end(j)) for i, j in pairs], blocks, residual)
-
-    def _put_new(self, pairs: list[Pair], Z: Array) -> None:
-        """Put keyframes that are seen for the first time where Z (m, p) says."""
-        manifold = self._manifold
-        for pair, seen in zip(pairs, Z, strict=True):
-            new = len(self._first)
-            if max(pair) == new:
-                _, _, seen_from = self._moved([min(pair)])
-                self._first.extend(manifold.compose(
-                    seen_from, seen if pair[1] == new else manifold.inverse(seen)))
-
-    def _moved(self, keyframes: list[int]) -> tuple[Array, Array, Array]:
-        """Return where keyframes began, their steps and where they are, (m, 2, p or k) each."""
-        manifold, known = self._manifold, self._first.view()
-        first = np.empty((len(keyframes), *known.shape[1:]))
-        steps = np.empty((*first.shape[:2], len(self._usual)))
-        for at, keyframe in enumerate(keyframes):
-            first[at] = known[keyframe] if keyframe != WORLD else manifold.identity(1)
-        ends = list(map(self._end, keyframes))
-        for which, system in enumerate(self._systems):
-            steps[:, which] = system.step(ends)
-        return first, steps, manifold.retract(first, steps)
-
-    def _end(self, keyframe: int) -> int:
-        """Return what a keyframe is called in the bordered systems."""
-        return max(keyframe - self._fixed, FIXED)
+        if turns:
+            return _LEFT_TO_THE_JUDGE
+        z, root = factors.measurement[self.rows], factors.sqrt_information[self.rows]
+        # 3. A keyframe is put where the first factor that sees it says.
+        if known in (i, j):
+            if self._drift and 0 <= min(i, j) == factors.predecessor[known]:
+                z = corrected(factors, np.array([self.rows]), self._drift)[0]
+            return _FIRST if border.append_keyframe(i, j, z, root) else None
+        # 4. The innovation of a loop in the L2 map, and its likelihood.
+        nis, log_likelihood, sigmas = border.predict(i, j, z, root)
+        if math.isnan(nis):
+            return None  # beyond double precision here; the next map may be able to take it
+        if what == GATE:
+            # 5. Gate it by its NIS and by the odds of a true loop to a false one.
+            fits = nis < self._limit
+            if log_likelihood == -math.inf or not (fits and self._volume + log_likelihood > 0):
+                border.refuse()
+                # One that leaves a component unsaid is left to the judge.
+                return (_LEFT_TO_THE_JUDGE if log_likelihood == -math.inf else
+                        Look(False, fits, math.sqrt(nis)))
+        # 6. Append it to both maps.
+        return Look(True, False, sigmas) if border.append() else None

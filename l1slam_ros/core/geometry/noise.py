@@ -24,6 +24,7 @@ from hashlib import blake2b
 import numpy as np
 from numpy.typing import NDArray
 
+from l1slam_ros.core import native
 from l1slam_ros.core.errors import NoiseError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 
@@ -48,6 +49,8 @@ LEAST_VARIANCE, MOST_VARIANCE = 1e-8, 1e6
 # Odometry is taken to know that much. Where sixty steps of Intel's have 100, the chain is torn and
 # the judgement finds no loop likely any more; at 10 it takes all.
 MOST_OF_ODOMETRY = 10.0
+# Of no more measurements than that, as they come one by one, a call costs more than its sums.
+_FEW = 8
 
 
 def square_root_information(information: Array) -> Array:
@@ -139,6 +142,8 @@ def silent_components(covariance: Array, absolute: bool) -> Mask:
 
 def usable(covariance: Array) -> Mask:
     """Tell which of (m, d, d) matrices are covariances, (m,): messages carry zeros and worse."""
+    if len(covariance) <= _FEW:
+        return native.noise.usable(np.ascontiguousarray(covariance), _ASYMMETRY, _SINGULAR)
     none = np.zeros(covariance.shape[:2], bool)
     flawed = np.any([bad for bad, _ in _flaws(covariance, none)], axis=0)
     return np.asarray(np.logical_not(flawed))
@@ -151,6 +156,8 @@ def without_unset(covariance: Array) -> Array:
     For `usable`: a message may leave z, roll and pitch unset, and its x, y and yaw are as good.
     What is all zeros stays so.
     """
+    if np.diagonal(covariance, axis1=1, axis2=2).all():
+        return covariance
     unset = np.asarray((covariance == 0).all(axis=2))
     return filled(covariance, unset & ~unset.all(axis=1, keepdims=True))
 
@@ -165,6 +172,8 @@ def within_bounds(
     model, (d, d), speaks for its component. Above `most` it becomes that, correlations are kept.
     """
     found = np.diagonal(covariance, axis1=1, axis2=2)
+    if found.min(initial=np.inf) >= LEAST_VARIANCE and found.max(initial=0.0) <= min(most, silent):
+        return covariance, []
     out = (found < LEAST_VARIANCE) | (found > silent)
     if out.any():
         modelled = (out * np.diagonal(model))[:, :, None] * np.eye(len(model))
@@ -203,6 +212,8 @@ def sigmas(manifold: Manifold, translation: float, rotation: float) -> Array:
 
 def root_of_inverse(covariance: Array) -> Array:
     """Return the root L', see `square_root_information`, for sound covariances (m, d, d)."""
+    if len(covariance) <= _FEW:
+        return native.noise.root_of_inverse(np.ascontiguousarray(covariance))
     silent = _without_variance(covariance)
     # Cholesky from the last row up gives U U' with U upper triangular, and L' = U^-1.
     lower = np.linalg.cholesky(filled(covariance, silent)[:, ::-1, ::-1])

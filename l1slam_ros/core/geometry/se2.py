@@ -25,6 +25,8 @@ TRANSLATION = slice(0, 2)
 ROTATION = slice(2, 3)
 # Where x, y and yaw stand in the 6x6 covariance of a ROS message (x y z rx ry rz).
 COVARIANCE_ROWS: tuple[int, ...] = (0, 1, 5)
+# Of no more poses than that, as they come one by one, a call costs more than its sums.
+_FEW = 8
 
 
 def wrap(angle: Array) -> Array:
@@ -55,17 +57,23 @@ def identity(n: int) -> Array:
 
 def compose(a: Array, b: Array) -> Array:
     """Return a b, (n, 3)."""
+    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+        return native.poses.compose(a, b)
     x, y = _turned(a[..., 2], b[..., 0], b[..., 1])
     return _pose(a[..., 0] + x, a[..., 1] + y, a[..., 2] + b[..., 2])
 
 
 def inverse(a: Array) -> Array:
     """Return a^-1, (n, 3)."""
+    if a.ndim == 2 and len(a) <= _FEW:
+        return native.poses.inverse(a)
     return _pose(*_turned(-a[..., 2], -a[..., 0], -a[..., 1]), -a[..., 2])
 
 
 def between(a: Array, b: Array) -> Array:
     """Return a^-1 b, (n, 3)."""
+    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+        return native.poses.between(a, b)
     moved = _turned(-a[..., 2], b[..., 0] - a[..., 0], b[..., 1] - a[..., 1])
     return _pose(*moved, b[..., 2] - a[..., 2])
 
@@ -138,6 +146,8 @@ def interpolate(a: Array, b: Array, fraction: Array) -> Array:
 
 def motion(step: Array) -> tuple[Array, Array]:
     """Return the length [m] and the angle [rad] of each relative pose, (n,) and (n,)."""
+    if step.ndim == 2 and len(step) <= _FEW:
+        return native.poses.motion(step)
     return np.hypot(step[..., 0], step[..., 1]), np.abs(step[..., 2])
 
 
@@ -158,6 +168,8 @@ def from_rotation(R: Array, t: Array) -> Array:
 
 def from_pose3(pose3: Array) -> Array:
     """Project x y z qx qy qz qw (n, 7) onto the plane: x, y and the yaw, (n, 3)."""
+    if pose3.ndim == 2 and len(pose3) <= _FEW:
+        return native.poses.onto_plane(pose3)
     qx, qy, qz, qw = (pose3[..., k] for k in range(3, 7))
     yaw = np.arctan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
     return np.concatenate((pose3[..., :2], yaw[..., None]), axis=-1)

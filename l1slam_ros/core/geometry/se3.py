@@ -32,6 +32,8 @@ COVARIANCE_ROWS: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
 _UNIT = 4 * np.finfo(float).eps
 # [rad] Below, terms of the fourth order of an angle are lost in rounding.
 _SMALL = 1e-4
+# Of no more poses than that, as they come one by one, a call costs more than its sums.
+_FEW = 8
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -101,29 +103,39 @@ def identity(n: int) -> Array:
 
 def compose(a: Array, b: Array) -> Array:
     """Return a b, (n, 7)."""
+    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+        return native.poses.compose(a, b)
     return _pose(a[..., :3] + _turned(a[..., 3:], b[..., :3]), _times(a[..., 3:], b[..., 3:]))
 
 
 def inverse(a: Array) -> Array:
     """Return a^-1, (n, 7)."""
+    if a.ndim == 2 and len(a) <= _FEW:
+        return native.poses.inverse(a)
     q = _opposite(a[..., 3:])
     return _pose(-_turned(q, a[..., :3]), q)
 
 
 def between(a: Array, b: Array) -> Array:
     """Return a^-1 b, (n, 7)."""
+    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+        return native.poses.between(a, b)
     q = _opposite(a[..., 3:])
     return _pose(_turned(q, b[..., :3] - a[..., :3]), _times(q, b[..., 3:]))
 
 
 def retract(pose: Array, step: Array) -> Array:
     """Return pose (rho, exp omega), (n, 7)."""
+    if pose.ndim == step.ndim == 2 and len(pose) <= _FEW >= len(step):
+        return native.poses.retract(pose, step)
     rows = np.ascontiguousarray(pose).reshape(-1, 7), np.ascontiguousarray(step).reshape(-1, 6)
     return native.se3.retract(*rows).reshape(pose.shape)
 
 
 def local(a: Array, b: Array) -> Array:
     """Return the step that retracts a to b, (n, 6)."""
+    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+        return native.poses.local(a, b)
     relative = between(a, b)
     return np.concatenate((relative[..., :3], _log(relative[..., 3:])), axis=-1)
 
@@ -190,6 +202,8 @@ def interpolate(a: Array, b: Array, fraction: Array) -> Array:
 
 def motion(step: Array) -> tuple[Array, Array]:
     """Return the length [m] and the angle [rad] of each relative pose, (n,) and (n,)."""
+    if step.ndim == 2 and len(step) <= _FEW:
+        return native.poses.motion(step)
     return np.linalg.norm(step[..., :3], axis=-1), np.linalg.norm(step[..., 3:], axis=-1)
 
 

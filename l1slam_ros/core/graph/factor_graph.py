@@ -43,7 +43,8 @@ class BetweenFactors:
     i, j : (m,) keyframe indices, i may be `WORLD`: an absolute factor; measurement : (m, p)
     relative poses; sqrt_information : (m, d, d) upper triangular roots, see `noise`, a zero row
     says nothing; trusted, struck : (m,) bool, a person or a marker vouches for it, or a person has
-    struck it out; predecessor : (n,) of the keyframes, see `FactorGraph`.
+    struck it out; predecessor : (n,) of the keyframes, see `FactorGraph`; told : some may be
+    trusted or struck.
     """
 
     i: Indices
@@ -53,6 +54,7 @@ class BetweenFactors:
     trusted: Mask
     struck: Mask
     predecessor: Indices
+    told: bool = True
 
     def __len__(self) -> int:
         return len(self.i)
@@ -120,6 +122,7 @@ class FactorGraph:
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
                          GrowingArray((), np.bool_)]
         self._factors: BetweenFactors | None = None
+        self._told = False  # of some factor: trusted, or struck
         if n_poses:
             self.add_poses(n_poses)
 
@@ -166,6 +169,7 @@ class FactorGraph:
         clone = self.without_factors()
         clone._between = [column.copy() for column in self._between]
         clone._factors = self._factors
+        clone._told = self._told
         return clone
 
     def without_factors(self) -> 'FactorGraph':
@@ -209,7 +213,7 @@ class FactorGraph:
             i, j, measurement, root, trusted, struck = (
                 column.view() for column in self._between)
             self._factors = BetweenFactors(
-                i, j, measurement, root, trusted, struck, self.predecessor)
+                i, j, measurement, root, trusted, struck, self.predecessor, self._told)
         return self._factors
 
     def add_poses(self, count: int = 1, robot: int = 0, begins_part: bool = False) -> None:
@@ -229,9 +233,14 @@ class FactorGraph:
 
     def append_step(self, measurement: Array, sqrt_information: Array, robot: int = 0) -> None:
         """Append a keyframe and the factor to it from the robot's last: (1, p), (1, d, d)."""
-        self.add_poses(1, robot)
-        self.append_between(self.predecessor[-1:], np.array([self.n_poses - 1]), measurement,
-                            sqrt_information)
+        before, keyframe = self._last.get(robot, NO_PREDECESSOR), self.n_poses
+        self._predecessor.append(before)
+        self._robot.append(robot)
+        self._last[robot] = keyframe
+        values = before, keyframe, measurement[0], sqrt_information[0], False, False
+        for column, value in zip(self._between, values, strict=True):
+            column.append(value)
+        self._factors = None
 
     def follow(self, keyframes: Indices, predecessors: Indices | int,
                robot: Indices | None = None) -> None:
@@ -285,13 +294,16 @@ class FactorGraph:
                        trusted: Mask | bool = False, struck: Mask | bool = False) -> None:
         """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
         none = np.zeros(len(i), bool)
-        values = i, j, measurement, sqrt_information, none | trusted, none | struck
+        trusted, struck = none | trusted, none | struck
+        self._told = self._told or bool(trusted.any() or struck.any())
+        values = i, j, measurement, sqrt_information, trusted, struck
         for column, value in zip(self._between, values, strict=True):
             column.extend(value)
         self._factors = None
 
     def say(self, rows: Indices, trusted: bool) -> None:
         """Let some between factors be vouched for, or else struck out; the last word counts."""
+        self._told = True
         for column, value in ((-2, trusted), (-1, not trusted)):
             said = self._between[column].view().copy()
             said[rows] = value

@@ -6,7 +6,9 @@ from . import cholesky as cholesky
 from . import dissection as dissection
 from . import halpern as halpern
 from . import interior_point as interior_point
+from . import noise as noise
 from . import ordering as ordering
+from . import poses as poses
 from . import prediction as prediction
 from . import scans as scans
 from . import se2 as se2

@@ -14,9 +14,11 @@
 #define NPY_TARGET_VERSION NPY_1_23_API_VERSION
 #include <numpy/arrayobject.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
+#include <memory>
 #include <new>
 #include <stdexcept>
 #include <string>
@@ -114,6 +116,25 @@ template <class T, int N> struct Convert<Array<T, N>> {
     }
     static PyObject* to(const Array<T, N>& made) { return made.object; }
 };
+// Rows of doubles that are only read, wherever they lie: of what Python has cut or repeated.
+struct Rows {
+    const char* data = nullptr;
+    int64_t shape[2] = {}, step[2] = {};  // step : in bytes
+};
+template <> struct Convert<Rows> {
+    static bool from(PyObject* object, Rows& rows, std::string& problem) {
+        auto* array = reinterpret_cast<PyArrayObject*>(object);
+        if (!PyArray_Check(object) || PyArray_TYPE(array) != NPY_DOUBLE ||
+            PyArray_NDIM(array) != 2 || !PyArray_ISBEHAVED_RO(array)) {
+            problem = "a float64 array of 2 dimensions";
+            return false;
+        }
+        rows.data = static_cast<const char*>(PyArray_DATA(array));
+        for (int n = 0; n < 2; n++)
+            rows.shape[n] = PyArray_DIM(array, n), rows.step[n] = PyArray_STRIDE(array, n);
+        return true;
+    }
+};
 template <> struct Convert<double> {
     static bool from(PyObject* object, double& value, std::string& problem) {
         value = PyFloat_AsDouble(object);
@@ -152,6 +173,39 @@ template <class... Ts> struct Convert<std::tuple<Ts...>> {
     template <size_t... I>
     static void set(PyObject* whole, const std::tuple<Ts...>& parts, std::index_sequence<I...>) {
         (PyTuple_SetItem(whole, I, Convert<Ts>::to(std::get<I>(parts))), ...);
+    }
+};
+
+
+// An object of C++ that Python holds: a type of its own, made by `add_type`, without a constructor.
+// Functions take it as a pointer, their first argument; they are its methods.
+template <class T> struct Held {
+    PyObject_HEAD
+    T* object;
+    inline static PyTypeObject* type = nullptr;
+
+    static void end(PyObject* self) {
+        PyTypeObject* own = Py_TYPE(self);
+        delete reinterpret_cast<Held*>(self)->object;
+        PyObject_Free(self);
+        Py_DECREF(own);
+    }
+};
+template <class T> struct Convert<T*> {
+    static bool from(PyObject* object, T*& value, std::string& problem) {
+        if (!PyObject_TypeCheck(object, Held<T>::type)) {
+            problem = "a " + std::string(T::NAME);
+            return false;
+        }
+        value = reinterpret_cast<Held<T>*>(object)->object;
+        return true;
+    }
+};
+template <class T> struct Convert<std::unique_ptr<T>> {
+    static PyObject* to(std::unique_ptr<T>& made) {
+        auto* held = PyObject_New(Held<T>, Held<T>::type);
+        if (held) held->object = made.release();
+        return reinterpret_cast<PyObject*>(held);
     }
 };
 
@@ -251,6 +305,36 @@ PyMethodDef method(const char* name, const char* signature) {
                 reinterpret_cast<void (*)()>(&Function<F, BRIEF, FEW>::call)),
             METH_FASTCALL, signature};
 }
+// The same for the method of a type: what it is called on is the first argument.
+template <auto F> struct Method;
+template <class R, class... Ts, R (*F)(Ts...)> struct Method<F> {
+    static PyObject* call(PyObject* self, PyObject* const* given, Py_ssize_t count) {
+        PyObject* all[sizeof...(Ts)] = {self};
+        if (count == static_cast<Py_ssize_t>(sizeof...(Ts)) - 1)
+            std::copy(given, given + count, all + 1);
+        return Function<F, true>::call(nullptr, all, count + 1);
+    }
+};
+template <auto F> PyMethodDef method_of_type(const char* name, const char* signature) {
+    Function<F, true>::signature = signature;
+    return {name,
+            reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(&Method<F>::call)),
+            METH_FASTCALL, signature};
+}
+// Adds the type of T to a module; its methods keep the interpreter's lock, so no two run at once.
+template <class T> bool add_type(PyObject* module, PyMethodDef* methods) {
+    PyType_Slot slots[] = {{Py_tp_dealloc, reinterpret_cast<void*>(&Held<T>::end)},
+                           {Py_tp_methods, methods},
+                           {0, nullptr}};
+    PyType_Spec spec{T::NAME, sizeof(Held<T>), 0,
+                     Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, slots};
+    PyObject* type = PyType_FromSpec(&spec);
+    Held<T>::type = reinterpret_cast<PyTypeObject*>(type);
+    const char* name = std::strrchr(T::NAME, '.');
+    Py_XINCREF(type);
+    return type && PyModule_AddObject(module, name ? name + 1 : T::NAME, type) == 0;
+}
+
 // Entries of a table of methods: a function of this namespace and the names of its arguments.
 // BRIEF keeps the interpreter's lock: for what takes less than 20 us.
 #define FUNCTION(function, arguments) \
@@ -260,3 +344,5 @@ PyMethodDef method(const char* name, const char* signature) {
 // BY_SIZE does so where all arrays together are that small: for a few nanoseconds a number.
 #define BY_SIZE(function, arguments) \
     method<&function, false, 5000>(#function, #function "(" arguments ")\n--\n\n")
+#define METHOD(function, arguments) \
+    method_of_type<&function>(#function, #function "(" arguments ")\n--\n\n")

@@ -7,7 +7,9 @@
 #include "dissection.hpp"
 #include "halpern.hpp"
 #include "interior_point.hpp"
+#include "noise.hpp"
 #include "ordering.hpp"
+#include "poses.hpp"
 #include "prediction.hpp"
 #include "scans.hpp"
 #include "se2.hpp"
@@ -21,15 +23,18 @@ namespace {
 struct Part {
     const char* name;
     PyMethodDef* methods;
+    bool (*add_types)(PyObject*) = nullptr;
 };
 const Part parts[] = {
     {"blocks", blocks::methods},
-    {"border", border::methods},
+    {"border", border::methods, border::add_types},
     {"cholesky", cholesky::methods},
     {"dissection", dissection::methods},
     {"halpern", halpern::methods},
     {"interior_point", interior_point::methods},
+    {"noise", noise::methods},
     {"ordering", ordering::methods},
+    {"poses", poses::methods},
     {"prediction", prediction::methods},
     {"scans", scans::methods},
     {"se2", se2::methods},
@@ -70,7 +75,8 @@ PyMODINIT_FUNC JOIN(PyInit_, NAME)() {
     for (size_t p = 0; module && p < PARTS; p++) {
         definitions[p] = definition_of(parts[p].name, parts[p].methods);
         PyObject* part = PyModule_Create(&definitions[p]);
-        if (!part || PyModule_AddObject(module, parts[p].name, part) < 0) {
+        if (!part || (parts[p].add_types && !parts[p].add_types(part)) ||
+            PyModule_AddObject(module, parts[p].name, part) < 0) {
             Py_XDECREF(part);
             Py_CLEAR(module);
         }

@@ -13,6 +13,7 @@ In: the relative pose of each odometry message to the one before. Out: whether a
 and the motion since the last keyframe with its covariance.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,8 +73,13 @@ def diagonal_covariance(manifold: Manifold, translation: float, rotation: float)
 
 def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:
     """Return the rows of messages' (..., 6, 6) covariances that the manifold has, (..., d, d)."""
-    rows = np.array(manifold.COVARIANCE_ROWS)
-    return covariance[..., rows[:, None], rows]
+    rows = manifold.COVARIANCE_ROWS
+    reduced = np.empty((*covariance.shape[:-2], len(rows), len(rows)))
+    # One by one: `covariance[..., rows[:, None], rows]` lets go of the interpreter's lock.
+    for r, row in enumerate(rows):
+        for c, column in enumerate(rows):
+            reduced[..., r, c] = covariance[..., row, column]
+    return reduced
 
 
 class Level:
@@ -89,8 +95,13 @@ class Level:
 
         Zeros, where that would not make a keyframe: a floor is not quite even.
         """
+        if self._manifold is se3:
+            return 0.0, 0.0
         pose3 = sample.pose3[None]
-        off = se3.local(self._manifold.to_pose3(self._manifold.from_pose3(pose3)), pose3)
+        _, _, z, qx, qy, *_ = sample.pose3.tolist()
+        # Most odometry only has a height to drop.
+        off = (np.array([[0.0, 0.0, z, 0.0, 0.0, 0.0]]) if qx == qy == 0.0 else
+               se3.local(self._manifold.to_pose3(self._manifold.from_pose3(pose3)), pose3))
         if self._first is None:
             self._first = off
         (length,), (angle,) = se3.motion(off - self._first)
@@ -230,8 +241,8 @@ class KeyframeMotion:
         self.bounded = []
         model = diagonal_covariance(
             self._manifold,
-            float(np.hypot(options.sigma_translation * self._metres, options.floor_translation)),
-            float(np.hypot(options.sigma_rotation * self._radians, options.floor_rotation)))
+            math.hypot(options.sigma_translation * self._metres, options.floor_translation),
+            math.hypot(options.sigma_rotation * self._radians, options.floor_rotation))
         stated = self._sum(model, verbatim) if self._stated else None
         return (model if stated is None else stated) + self._unseen
 
@@ -254,7 +265,7 @@ class KeyframeMotion:
         stated = np.array(self._stated)
         if not noise.usable(noise.without_unset(stated)).all():
             return None
-        if len(stated) == 1:
+        if len(stated) == 1:  # as of most keyframes that are messages
             return stated
         Ad = manifold.adjoint(manifold.between(end, np.concatenate(self._poses)))
         return Ad @ stated @ Ad.transpose(0, 2, 1)

@@ -249,7 +249,7 @@ class RobotOdometry:
 
     def _number_keyframe(self) -> None:
         """Note that the newest keyframe of the graph is the track's newest."""
-        self.track.numbers.extend(np.array([self._shared.graph.n_poses - 1]))
+        self.track.numbers.append(self._shared.graph.n_poses - 1)
 
     def end(self) -> TrackEnd:
         """Return where the odometry has come to; there are keyframes."""

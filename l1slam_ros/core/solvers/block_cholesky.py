@@ -240,20 +240,10 @@ class BlockCholesky:
         pivots = corner[:, None] + np.arange(self._last.block_size) * (stride[:, None] + 1)
         return 2 * float(np.log(self._last.panels[pivots]).sum())
 
-    def covariances(self, at: Indices, parent: Indices, turn: Array, kept: Array,
-                    begins: Indices) -> tuple[Array, Array]:
-        """
-        Return the covariances of points with the last one by the last factorisation, (t, k, k).
-
-        And the columns of that one, (k, w). at : (t,) the place of each in the order of
-        elimination, -1 for none; parent, turn, kept, begins : see `kernels.border`
-        """
-        layout = self._last
-        product = np.empty((len(at), *turn.shape[1:]))
-        columns: Array = kernels.border.reach(
-            layout.panels, *layout.shape, self.pattern.owner, at, parent, turn, kept, begins,
-            product)
-        return product, columns
+    @property
+    def factor(self) -> tuple[Array | Indices | Places, ...]:
+        """The factor of the last factorisation, as `native.border.front` takes it."""
+        return self._last.panels, *self._last.shape, self.pattern.position, self.pattern.owner
 
 
 def _cores() -> int:

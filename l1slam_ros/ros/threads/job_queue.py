@@ -9,6 +9,7 @@
 """A queue of the work of services, which a thread of its own carries out in order."""
 
 import queue
+import threading
 from collections.abc import Callable
 
 from rclpy.node import Node
@@ -16,7 +17,6 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from l1slam_ros.core.errors import Interrupted, L1SlamError
-from l1slam_ros.ros.threads.background import background
 from l1slam_ros.ros.threads.failures import Failures, reason
 
 # [s] How long a failure of a service is shown, as it may not be called again.
@@ -45,7 +45,7 @@ class JobQueue:
         # Name, work, and the future of the answer; None ends the thread.
         self._queue: queue.SimpleQueue[tuple[str, Callable[[], str], Future] | None] = (
             queue.SimpleQueue())
-        self._thread = background('services', self._work)
+        self._thread = threading.Thread(target=self._work, name='services', daemon=True)
 
     def start(self) -> None:
         """Begin."""

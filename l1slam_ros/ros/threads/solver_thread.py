@@ -61,7 +61,6 @@ class SolverThread:
         tell : publishes what is new; called when an update has taken in what has come, and at its
             end, with what it did, None: nothing
         """
-        # With as much priority as messages: an update is short, and its workers have less.
         self._thread = threading.Thread(
             target=self._work, args=(tell,), name='solver', daemon=True)
         self._thread.start()

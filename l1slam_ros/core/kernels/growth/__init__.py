@@ -8,6 +8,4 @@
 # SPDX-License-Identifier: Apache-2.0
 """What only a graph that grows needs; a graph that is solved once does without compiling it."""
 
-from l1slam_ros.core.kernels.growth.points import move_children, pull_parents
-
-__all__ = ['move_children', 'pull_parents']
+__all__: list[str] = []

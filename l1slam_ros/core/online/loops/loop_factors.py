@@ -192,9 +192,9 @@ class LoopFactors:
         own = robots[:, 0] == robots[:, 1]
         # What one robot saw of itself was known with its later end.
         until = np.where(own[:, None], times[:, 1:], times)
-        ends = tracks.of_each(robots.ravel())
-        known = ends.known_until(arrivals.ravel(), until.ravel())
-        pairs = ends.nearest_keyframe(times.ravel(), known).reshape(-1, 2)
+        ends = tracks.of_each(robots.reshape(-1))
+        known = ends.known_until(arrivals.reshape(-1), until.reshape(-1))
+        pairs = ends.nearest_keyframe(times.reshape(-1), known).reshape(-1, 2)
         first = ends.first().reshape(-1, 2)
         can = np.flatnonzero(self._can_be_factors(due, pairs, first)).tolist()
         new: list[int] = []
@@ -206,7 +206,8 @@ class LoopFactors:
                 self._row_of[due[k].key] = before + len(new)
                 new.append(k)
         if new:
-            self._append([due[k] for k in new], pairs[new], graph, tracks, options)
+            chosen = pairs if len(new) == len(pairs) else pairs[new]
+            self._append([due[k] for k in new], chosen, graph, tracks, options)
         for k in can:
             # A word is of loops that came before it, though others become factors with them.
             self._say(due[k], (int(pairs[k, 0]), int(pairs[k, 1])), graph,
@@ -218,10 +219,11 @@ class LoopFactors:
         """Carry loops to the keyframes pairs (m, 2), and make factors of them."""
         manifold = self._manifold
         m = len(loops)
-        times, robots = (column.T.ravel() for column in _times(loops))
+        # References first, then ends: to `ravel` columns lets go of the interpreter's lock.
+        times, robots = (np.concatenate((column[:, 0], column[:, 1])) for column in _times(loops))
         ends = tracks.of_each(robots)
         at = ends.at(times)
-        keyframes = ends.poses_of(pairs.T.ravel())
+        keyframes = ends.poses_of(np.concatenate((pairs[:, 0], pairs[:, 1])))
         ways = manifold.between(np.concatenate((keyframes[:m], at[m:])),
                                 np.concatenate((at[:m], keyframes[m:])))
         unseen = ends.unseen(times)

@@ -19,6 +19,7 @@ interpolation between their neighbours would miss by more than any measurement m
 
 import numpy as np
 
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import LEAST_VARIANCE, Mask
 from l1slam_ros.core.graph.growable_array import GrowingArray, few_rows
@@ -28,6 +29,8 @@ from l1slam_ros.core.online.odometry.silences import Silences
 
 # So many keyframes tell how fast the robot goes.
 _RECENT = 16
+# So many of its poses are copied one by one, see `few_rows`.
+_FEW = 8
 
 # So many samples at once are thinned out, once as many more have come.
 _BLOCK = 512
@@ -110,8 +113,7 @@ class OdometryTrack:
     def poses_of(self, keyframes: Indices | slice) -> Array:
         """Return the poses of some keyframes, (m, p)."""
         rows, poses = self._keyframes.view()[keyframes], self._poses.view()
-        # Each update asks for the first one and for the last.
-        return few_rows(poses, rows) if len(rows) == 1 else poses[rows]
+        return few_rows(poses, rows) if len(rows) <= _FEW else poses[rows]
 
     @property
     def gaps(self) -> Indices:
@@ -153,11 +155,11 @@ class OdometryTrack:
             self.begin_part(stamp)
         elif any(reach) and self._parts.view()[-1, 0] < len(self):
             self._silences.add(self.last, stamp + self._shifts[-1][1], reach, True)
-        self._times.extend(np.array([stamp + self._shifts[-1][1]]))
-        self._poses.extend(pose)
+        self._times.append(stamp + self._shifts[-1][1])
+        self._poses.append(pose[0])
         if is_keyframe:
-            self._keyframes.extend(np.array([len(self) - 1]))
-            self._keyframe_stamps.extend(np.array([stamp]))
+            self._keyframes.append(len(self) - 1)
+            self._keyframe_stamps.append(stamp)
 
     def went_by(self, stamp: int, pose: Array) -> Array | None:
         """
@@ -285,15 +287,16 @@ class OdometryTrack:
         update happens to look for it.
         """
         samples = self._times.view()
-        return np.maximum(arrivals, samples[np.searchsorted(samples, times)])
+        return np.maximum(arrivals, samples[native.poses.places(samples, times, False)])
 
     def nearest_keyframe(self, times: Indices, known: Indices) -> Indices:
         """Return the keyframe nearest to each time, of its part and up to `known`, (m,)."""
         samples, keyframes = self._times.view(), self._keyframes.view()
         first, end = self._part(times, 2, len(keyframes))
         # By the samples: the times of all keyframes would have to be copied together.
-        next_one = np.searchsorted(keyframes, np.searchsorted(samples, times))
-        unknown = np.searchsorted(keyframes, np.searchsorted(samples, known, side='right'))
+        places = native.poses.places
+        next_one = places(keyframes, places(samples, times, False), False)
+        unknown = places(keyframes, places(samples, known, True), False)
         after = np.clip(next_one, first, np.minimum(unknown, end) - 1)
         before = np.maximum(after - 1, first)
         nearer_before = times - samples[keyframes[before]] <= samples[keyframes[after]] - times
@@ -301,13 +304,9 @@ class OdometryTrack:
 
     def at(self, times: Indices) -> Array:
         """Return the poses at some times, interpolated between samples of a part, (m, p)."""
-        samples, poses = self._times.view(), self._poses.view()
+        samples = self._times.view()
         first, end = self._part(times, 0, len(samples))
-        after = np.clip(np.searchsorted(samples, times), np.minimum(first + 1, end - 1), end - 1)
-        before = np.maximum(after - 1, first)
-        span = np.maximum(samples[after] - samples[before], 1)
-        fraction = np.minimum((times - samples[before]) / span, 1.0)
-        return self._manifold.interpolate(poses[before], poses[after], fraction)
+        return native.poses.interpolate(samples, self._poses.view(), first, end, times)
 
     def _part(self, times: Indices, column: int, count: int) -> tuple[Indices, Indices]:
         """Return the first sample or keyframe, and past the last, of the part of each, or all."""

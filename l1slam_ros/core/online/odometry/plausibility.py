@@ -77,11 +77,11 @@ class Point:
     seconds : since the sample before; doubt : the cause it was held for, else empty; gap : why no
     motion is known from the sample before, unsure : why it is hardly known, else empty; unseen :
     how far the robot may have gone [m] meanwhile; reach : see `RecentMotion.reach`; anew : the
-    only sample before it was a stray.
+    only sample before it was a stray; variance : of the position, as it is stated [m2].
     """
 
     __slots__ = ('anew', 'doubt', 'gap', 'pose', 'position', 'reach', 'sample', 'seconds',
-                 'stamp', 'unseen', 'unsure')
+                 'stamp', 'unseen', 'unsure', 'variance')
 
     def __init__(self, manifold: Manifold, sample: OdometrySample):
         self.sample = sample
@@ -93,11 +93,7 @@ class Point:
         self.anew = False
         self.seconds = 0.0
         self.reach = 0.0, 0.0
-
-    @property
-    def variance(self) -> float:
-        """Of the position, as it is stated [m2]."""
-        return sum(self.sample.covariance.diagonal()[:3].tolist())
+        self.variance: float = sum(sample.covariance.diagonal()[:3].tolist())
 
 
 def is_identity(manifold: Manifold, pose: Array) -> bool:
@@ -142,6 +138,9 @@ class RecentMotion:
     def __init__(self, manifold: Manifold):
         self._manifold = manifold
         self._steps: deque[Step] = deque(maxlen=_RECENT)
+        # What `pace` and `_usual` are by these steps; None: to be worked out.
+        self._paced: tuple[float, float] | None = None
+        self._usually: float | None = None
         self._fastest_turn = _TURN  # of all steps [rad/s]
         # The last silence in which it made next to no way, and how long ago that was [s].
         self._stood = 0.0
@@ -150,6 +149,7 @@ class RecentMotion:
     def forget(self) -> None:
         """Begin with no step."""
         self._steps.clear()
+        self._paced = self._usually = None
         self._stood = 0.0
 
     def hear(self, step: Step) -> None:
@@ -165,6 +165,7 @@ class RecentMotion:
     def add(self, step: Step) -> None:
         """Take a step in that the robot has made."""
         self._steps.append(step)
+        self._paced = self._usually = None
         self._fastest_turn = max(self._fastest_turn, step.radians / step.span)
 
     @property
@@ -176,16 +177,22 @@ class RecentMotion:
         """Return how fast the robot moves [m/s] and turns [rad/s]: in the mean, or now if more."""
         if not self._steps:
             return 0.0, 0.0
-        last = self._steps[-1]
-        span = max(sum(step.seconds for step in self._steps), SHORTEST_STEP)
-        return (max(sum(step.metres for step in self._steps) / span, last.metres / last.span),
-                max(sum(step.radians for step in self._steps) / span, last.radians / last.span))
+        if self._paced is None:
+            last = self._steps[-1]
+            span = max(sum([step.seconds for step in self._steps]), SHORTEST_STEP)
+            metres, radians = ([step.metres for step in self._steps],
+                               [step.radians for step in self._steps])
+            self._paced = (max(sum(metres) / span, last.metres / last.span),
+                           max(sum(radians) / span, last.radians / last.span))
+        return self._paced
 
     @property
     def _usual(self) -> float:
         """The usual time from one sample to the next [s], some of which may come at once."""
-        usual = sorted(step.seconds for step in self._steps)
-        return max(usual[len(usual) // 2], sum(usual) / len(usual)) if usual else 0.0
+        if self._usually is None:
+            usual = sorted([step.seconds for step in self._steps])
+            self._usually = max(usual[len(usual) // 2], sum(usual) / len(usual)) if usual else 0.0
+        return self._usually
 
     def is_silence(self, seconds: float) -> bool:
         """Tell whether so long passes between two samples only where many are missing."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
 
@@ -124,11 +125,14 @@ class Ends:
     def poses_of(self, keyframes: Indices) -> Array:
         """Return the poses of keyframes of the graph, (m, p)."""
         return self._of_all(lambda track, at: track.poses_of(
-            np.searchsorted(track.numbers.view(), keyframes[at])))
+            native.poses.places(track.numbers.view(), keyframes[at], False)))
 
     def _of_all(self, of: Callable[[OdometryTrack, Indices | slice], Any],
                 kind: type = float) -> Any:
         """Return what tracks say, one after the other, each of its rows."""
+        if len(self._groups) == 1:  # as of most
+            values: Any = np.asarray(of(*self._groups[0]), kind)
+            return values if values.ndim else np.full(self._count, values)
         said: Any = None
         for track, rows in self._groups:
             values = np.asarray(of(track, rows))

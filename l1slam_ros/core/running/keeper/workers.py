@@ -12,8 +12,6 @@ Threads that carry out work; their callers decide which work, and when.
 In: pieces of work, as functions. Out: that they have ended, or the error that they raised.
 """
 
-import os
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -24,20 +22,9 @@ from l1slam_ros.core.running.improve import Check
 
 # [s] How often a waiting thread checks whether to stop.
 LOOK = 0.05
-# With this niceness a thread that does not make way gets three quarters of a core that it shares
-# with one that does. With a higher one, on a busy machine, a thread that holds Python's lock would
-# seldom run, and all others would wait for it: with 10, beside a process that takes all it can get
-# of the core, updates take longer (p99 170 ms) than where workers do not make way (106).
-_NICE = 5
 
 # A function that is called often during work and raises if the work is to stop.
 Stopped = Callable[[], bool]
-
-
-def make_way() -> None:
-    """From now on give this thread, and those that it starts, less priority than its starter."""
-    if sys.platform == 'linux':  # elsewhere it would apply to the whole process
-        os.nice(_NICE)
 
 
 def until(over: Stopped, check: Check = lambda: None) -> Check:
@@ -193,7 +180,6 @@ class Worker:
     def _run(self, work: Callable[[], None]) -> None:
         with self._starting:
             pass
-        make_way()  # for updates, which would wait for it where cores are few
         try:
             work()
             self.failed = False
