@@ -42,8 +42,6 @@ SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interio
 JUDGEMENT = ('prediction',)
 DENSE = ('halpern',)
 ONLINE = ('border', 'growth.elimination', 'growth.points')
-# Modules of `core` for matching scans.
-SCANS = ('scans.kernels', 'scans.search_kernels')
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 # What poses in space need in addition: versions of a module's loops for arrays of other sizes.
 IN_SPACE = {'halpern': f'halpern{objects.SPACE}', 'blocks': f'blocks{objects.SPACE}',

@@ -3,10 +3,14 @@
 #include "arrays.hpp"
 #include "blocks.hpp"
 #include "border.hpp"
+#include "branch_and_bound.hpp"
 #include "cholesky.hpp"
 #include "interior_point.hpp"
+#include "likelihood_field.hpp"
 #include "ordering.hpp"
-#include "scans.hpp"
+#include "ray_casting.hpp"
+#include "scan_matching.hpp"
+#include "scan_points.hpp"
 #include "se2.hpp"
 #include "se3.hpp"
 #include "substitution.hpp"
@@ -21,10 +25,14 @@ struct Part {
 const Part parts[] = {
     {"blocks", blocks::methods},
     {"border", border::methods},
+    {"branch_and_bound", branch_and_bound::methods},
     {"cholesky", cholesky::methods},
     {"interior_point", interior_point::methods},
+    {"likelihood_field", likelihood_field::methods},
     {"ordering", ordering::methods},
-    {"scans", scans::methods},
+    {"ray_casting", ray_casting::methods},
+    {"scan_matching", scan_matching::methods},
+    {"scan_points", scan_points::methods},
     {"se2", se2::methods},
     {"se3", se3::methods},
     {"substitution", substitution::methods},

@@ -19,10 +19,10 @@ from functools import cached_property
 
 import numpy as np
 
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.scans import kernels
 
 # [m] Points are at least so far apart along a scan.
 SPACING = 0.05
@@ -138,7 +138,7 @@ def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
     lone = _lone(xy[hit], np.maximum(widest, widening * reach[hit]))
     seen, stray = xy[hit][~lone], xy[hit][lone]
     normals = np.zeros_like(seen)
-    count = kernels.surface_along(
+    count = native.scan_points.surface_along(
         seen, centre, SPACING, widest, widening, max(_OFF_LINE, _OFF_OF_NOISE * noise),
         np.empty_like(seen), normals)
     return Points(np.concatenate((seen[:count], stray)),

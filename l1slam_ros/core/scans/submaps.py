@@ -15,9 +15,9 @@ from functools import cached_property
 
 import numpy as np
 
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.field import Field
 from l1slam_ros.core.scans.points import Points, have_normal, transformed, turn
 
@@ -132,8 +132,7 @@ def seen_by(viewer: Submap, seen: Submap, pose: Array) -> tuple[int, int]:
     The latter are where the viewer's rays pass through; where it did not look, none are counted.
     """
     points = np.ascontiguousarray(transformed(pose, seen.xy))
-    agree, through = kernels.contradictions(points, viewer.views, viewer.centres, _PAST)
-    return int(agree), int(through)
+    return native.ray_casting.contradictions(points, viewer.views, viewer.centres, _PAST)
 
 
 class Submaps:
