@@ -14,6 +14,7 @@ from . import se2 as se2
 from . import se3 as se3
 from . import substitution as substitution
 from . import symbolic as symbolic
+from . import voxel_grid as voxel_grid
 
 LEVELS: tuple[str, ...]
 level: str

@@ -15,6 +15,7 @@
 #include "se3.hpp"
 #include "substitution.hpp"
 #include "symbolic.hpp"
+#include "voxel_grid.hpp"
 
 namespace {
 
@@ -37,6 +38,7 @@ const Part parts[] = {
     {"se3", se3::methods},
     {"substitution", substitution::methods},
     {"symbolic", symbolic::methods},
+    {"voxel_grid", voxel_grid::methods},
 };
 constexpr size_t PARTS = sizeof parts / sizeof *parts;
 

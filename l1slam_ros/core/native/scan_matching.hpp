@@ -93,7 +93,7 @@ inline Sums sums_of(const Matched& of, const double* pose, double gate, double s
 
 using Three = double[3][3];
 
-inline void fill_symmetric(const double (&upper)[6], Three& whole) {
+inline void fill_symmetric(const double* upper, Three& whole) {
     for (int r = 0, at = 0; r < 3; r++)
         for (int c = r; c < 3; c++) whole[r][c] = whole[c][r] = upper[at++];
 }
@@ -129,8 +129,8 @@ inline void eigen(Three& A, Three& V) {
 }
 
 // Take out of H and g what is said of a direction by the errors of normals alone, which are off
-// by `off_normal` [rad]. Directions are compared in `units`.
-inline void hold(Three& H, double (&g)[3], Vector<const double> units, double off_normal) {
+// by `off_normal` [rad]. Directions are compared in `units`; returns the least eigenvalue in these.
+inline double hold(Three& H, double (&g)[3], Vector<const double> units, double off_normal) {
     Three A, V;
     double part[3], along[3];
     for (int r = 0; r < 3; r++)
@@ -151,6 +151,7 @@ inline void hold(Three& H, double (&g)[3], Vector<const double> units, double of
                 H[r][c] += V[r][k] / units[r] * part[k] * A[k][k] * V[c][k] / units[c];
         }
     }
+    return std::min({part[0] * A[0][0], part[1] * A[1][1], part[2] * A[2][2]});
 }
 
 // Add to A and b what a prior says: |t2v(prior^-1 pose)|^2 by its information.
@@ -204,8 +205,9 @@ inline Vector<double> normal_equations(
 }
 
 // All rounds of Gauss-Newton from a pose on; returns the last pose, H without what `hold` takes
-// out, and the sums before it. `gate` is that of the first round, `variance` is of a residual.
-inline std::tuple<Vector<double>, Matrix<double>, Vector<double>> match(
+// out, its least eigenvalue, and the sums before it. `gate` is that of the first round, `variance`
+// is of a residual.
+inline std::tuple<Vector<double>, Matrix<double>, double, Vector<double>> match(
     Matrix<const double> points, Matrix<const double> normals, Matrix<const double> map_points,
     Matrix<const double> map_normals, Matrix<const int32_t> nearest, Vector<const double> origin,
     double resolution, Vector<const double> start, Vector<const double> prior,
@@ -222,11 +224,12 @@ inline std::tuple<Vector<double>, Matrix<double>, Vector<double>> match(
     std::copy_n(start.data, 3, pose);
     Three H;
     Sums sums{};
+    double least = 0.0;
     for (int round = 0; round < MOST_ROUNDS; round++) {
         sums = sums_of(of, pose, gate, scale);
         fill_symmetric(sums.H, H);
         double g[3] = {sums.g[0], sums.g[1], sums.g[2]};
-        hold(H, g, units, off_normal);
+        least = hold(H, g, units, off_normal);
         Three A;
         double b[3], step[3];
         for (int r = 0; r < 3; r++) {
@@ -241,11 +244,60 @@ inline std::tuple<Vector<double>, Matrix<double>, Vector<double>> match(
         pose[2] = se2::wrapped(pose[2] - step[2]);
         const bool was_narrow = gate <= NARROWEST;
         gate = std::max(gate * SHRINK, NARROWEST);
-        if (was_narrow && std::max({std::abs(step[0]), std::abs(step[1]), std::abs(step[2])}) < STILL)
-            break;
+        const double moved =
+            std::max({std::abs(step[0]), std::abs(step[1]), std::abs(step[2])});
+        if (was_narrow && moved < STILL) break;
     }
     std::copy_n(&H[0][0], 9, held.data);
-    return {end, held, array_of(sums)};
+    return {end, held, least, array_of(sums)};
+}
+
+// H over a variance [m^2], or less where `scatter`, the covariance of the gradient, is more than
+// the variance times H: of each direction the greater of both counts.
+inline Matrix<double> information(Matrix<const double> H, Vector<const double> scatter,
+                                  double variance) {
+    require(H.shape[0] == 3 && H.shape[1] == 3, "H must be (3, 3)");
+    require(scatter.size() == 6, "scatter must have six entries");
+    // With L L' = H: the eigenvectors of L^-1 scatter L^-T, and H L^-T times these.
+    Three L = {}, A, V, root;
+    for (int c = 0; c < 3; c++) {
+        double square = H(c, c) + LEAST;
+        for (int k = 0; k < c; k++) square -= L[c][k] * L[c][k];
+        L[c][c] = std::sqrt(std::max(square, LEAST));
+        for (int r = c + 1; r < 3; r++) {
+            L[r][c] = H(r, c);
+            for (int k = 0; k < c; k++) L[r][c] -= L[r][k] * L[c][k];
+            L[r][c] /= L[c][c];
+        }
+    }
+    fill_symmetric(scatter.data, A);
+    for (int side = 0; side < 2; side++)  // from the left, and, transposed, from the right
+        for (int c = 0; c < 3; c++)
+            for (int r = 0; r < 3; r++) {
+                double& entry = side ? A[c][r] : A[r][c];
+                for (int k = 0; k < r; k++) entry -= L[r][k] * (side ? A[c][k] : A[k][c]);
+                entry /= L[r][r];
+            }
+    eigen(A, V);
+    for (int c = 0; c < 3; c++) {
+        double x[3];
+        for (int r = 2; r >= 0; r--) {
+            x[r] = V[r][c];
+            for (int k = r + 1; k < 3; k++) x[r] -= L[k][r] * x[k];
+            x[r] /= L[r][r];
+        }
+        for (int r = 0; r < 3; r++)
+            root[r][c] = H(r, 0) * x[0] + H(r, 1) * x[1] + H(r, 2) * x[2];
+    }
+    auto made = new_array<double, 2>({3, 3});
+    for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 3; c++) {
+            made(r, c) = 0.0;
+            for (int k = 0; k < 3; k++)
+                made(r, c) +=
+                    root[r][k] / std::max(A[k][k] / variance, 1.0) * root[c][k] / variance;
+        }
+    return made;
 }
 
 static PyMethodDef methods[] = {
@@ -255,6 +307,7 @@ static PyMethodDef methods[] = {
     FUNCTION(match,
              "points, normals, map_points, map_normals, nearest, origin, resolution, start, "
              "prior, information, units, gate, scale, variance, off_normal"),
+    BRIEF(information, "H, scatter, variance"),
     {}};
 
 }  // namespace scan_matching

@@ -22,12 +22,20 @@ def normal_equations(points: Array, normals: Array, map_points: Array, map_norma
 def match(points: Array, normals: Array, map_points: Array, map_normals: Array,
           nearest: NDArray[np.int32], origin: Array, resolution: float, start: Array,
           prior: Array, information: Array, units: Array, gate: float, scale: float,
-          variance: float, off_normal: float) -> tuple[Array, Array, Array]:
+          variance: float, off_normal: float) -> tuple[Array, Array, float, Array]:
     """
-    Return the pose (3,), H (3, 3) and the sums (17,) of the last round from a pose on.
+    Return pose (3,), H (3, 3), its least eigenvalue in `units` and the sums of the last round.
 
-    prior, information : (3,) and (3, 3) in its axes; units : (3,) in which directions are
+    start : (3,); prior, information : (3,) and (3, 3) in its axes; units : (3,) in which directions are
     compared; gate : of the first round [m]; variance : of a residual [m^2]; off_normal : [rad]
     normals are off by so much, and what they say by that alone is taken out of H. The others as
     above.
+    """
+
+def information(H: Array, scatter: Array, variance: float) -> Array:
+    """
+    Return H over a variance, or less where a gradient scatters more, (3, 3).
+
+    H : (3, 3); scatter : (6,) the upper triangle of the covariance of the gradient by rows;
+    variance : [m^2] by which H would be that covariance
     """

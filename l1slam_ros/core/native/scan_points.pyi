@@ -1,14 +1,16 @@
 """From rays to points with normals; see `l1slam_ros.core.scans.points`."""
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 
-def surface_along(points: Array, centre: Array, spacing: float, least_reach: float,
-                  widening: float, off: float, away: Array, normals: Array) -> int:
+def points_of(ends: Array, ranges: Array, angles: Array, bearings: Indices, bins: int,
+              range_min: float, range_max: float, increment: float, centre: Array
+              ) -> tuple[Array, Array, Array]:
     """
-    Thin out the points of a scan in place, and find their normals; return how many are left.
+    Return the points of a scan, their normals, (n, 2) each, and its view, (bins,).
 
-    points : (n, 2) [m], following each other; centre : (2,) of the laser; spacing : [m] between
-    points that are kept; least_reach, widening : [m], [m/m] of the range: neighbours within the
-    greater one are of one line; off : [m] RMS distance from it; away, normals : (n, 2), take the
-    points as seen from the laser and, from zeros, the normals
+    ends : (r, 2) of the rays [m]; ranges, angles : (r,) [m], [rad]; bearings : (r,) in which of the
+    equal bins from 0 to 2 pi each is; range_min, range_max : ranges outside are of no surface [m];
+    increment : between rays [rad]; centre : (2,) of the laser [m]. A normal is of length 1 and
+    turned to the laser, or zero. The view is the least range in each bin, infinite: nothing was in
+    range, NaN: the laser did not look.
     """

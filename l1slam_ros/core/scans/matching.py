@@ -37,14 +37,10 @@ FINEST = 0.02
 # of the odometry: the squared error of a step, over its variance, is 1 in x, y and heading.
 KAPPA = 1.5
 _VARIANCE = KAPPA * SIGMA**2
-# What a step is held by where neither points nor a prior hold it.
-_LEAST = 1e-9 * np.eye(3)
 # [rad] Normals are off by so much: what they say of the way along a wall is noise.
 _OFF_NORMAL = 0.05
 # [m] Points farther than this do not match in the first round; each is narrower than the last.
 _WIDEST = REACH
-# Where the entries of a symmetric matrix are in its upper triangle.
-_SYMMETRIC = np.array(((0, 1, 2), (1, 3, 4), (2, 4, 5)))
 # Of no prior.
 _NOTHING = np.zeros((3, 3))
 
@@ -82,14 +78,13 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
     units = np.array([1.0, 1.0, 1.0 / max(radius, 0.1)])
     if prior is None or prior_information is None:
         prior, prior_information = start, _NOTHING
-    pose, H, sums = native.scan_matching.match(
+    pose, H, least, sums = native.scan_matching.match(
         xy, normals, field.xy, field.normals, field.nearest, field.origin, RESOLUTION, start,
         prior, prior_information, units, widest, _SCALE, _VARIANCE, _OFF_NORMAL)
-    count = sums[15]
-    curvature = float(np.linalg.eigvalsh(H * np.outer(units, units))[0] / max(count, 1.0))
-    square = max(FINEST**2, sums[16] / max(count, 1.0))
-    information = _information(H, sums[6 + _SYMMETRIC], KAPPA * square)
-    return Match(pose, information, count / max(len(xy), 1), curvature)
+    count = float(sums[15])
+    square = max(FINEST**2, float(sums[16]) / max(count, 1.0))
+    information = _information(H, sums[6:12], KAPPA * square)
+    return Match(pose, information, count / max(len(xy), 1), least / max(count, 1.0))
 
 
 def _information(H: Array, scatter: Array, variance: float) -> Array:
@@ -97,13 +92,10 @@ def _information(H: Array, scatter: Array, variance: float) -> Array:
     Return the information of matched points, (3, 3): H over a variance [m^2], or less.
 
     Where neighbours are off together (what has moved, normals of what is bent, a map whose scans
-    disagree) the gradient's covariance is `scatter`, the sum of the squares of its parts, and not
-    the variance times H. Of each direction the greater of both counts.
+    disagree) the gradient's covariance is `scatter`, the sum of the squares of its parts (6,), and
+    not the variance times H. Of each direction the greater of both counts.
 
     Source: White, "Maximum likelihood estimation of misspecified models", 1982; groups: Liang and
     Zeger, "Longitudinal data analysis using generalized linear models", 1986.
     """
-    L = np.linalg.cholesky(H + _LEAST)
-    values, axes = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, scatter).T) / variance)
-    root = H @ np.linalg.solve(L.T, axes)
-    return (root / np.maximum(values, 1.0)) @ root.T / variance
+    return native.scan_matching.information(H, scatter, variance)
