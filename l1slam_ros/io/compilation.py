@@ -38,13 +38,6 @@ from l1slam_ros.io.progress import Progress
 
 # Modules of `kernels` for a sparse graph, for judging loops, for a dense graph, and for a graph
 # that grows.
-SPARSE: tuple[str, ...] = ()
-JUDGEMENT: tuple[str, ...] = ()
-DENSE: tuple[str, ...] = ()
-ONLINE: tuple[str, ...] = ()
-# Modules of `core` for matching scans.
-SCANS = ('scans.kernels', 'scans.search_kernels')
-STEPS = (*ONLINE, *SPARSE)
 # What poses in space need in addition: versions of a module's loops for arrays of other sizes.
 IN_SPACE: dict[str, str] = {}
 

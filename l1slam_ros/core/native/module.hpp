@@ -3,20 +3,25 @@
 #include "arrays.hpp"
 #include "blocks.hpp"
 #include "border.hpp"
+#include "branch_and_bound.hpp"
 #include "cholesky.hpp"
 #include "dissection.hpp"
 #include "halpern.hpp"
 #include "interior_point.hpp"
+#include "likelihood_field.hpp"
 #include "noise.hpp"
 #include "ordering.hpp"
 #include "poses.hpp"
 #include "prediction.hpp"
-#include "scans.hpp"
+#include "ray_casting.hpp"
+#include "scan_matching.hpp"
+#include "scan_points.hpp"
 #include "se2.hpp"
 #include "se3.hpp"
 #include "spanning_tree.hpp"
 #include "substitution.hpp"
 #include "symbolic.hpp"
+#include "voxel_grid.hpp"
 
 namespace {
 
@@ -28,20 +33,25 @@ struct Part {
 const Part parts[] = {
     {"blocks", blocks::methods},
     {"border", border::methods, border::add_types},
+    {"branch_and_bound", branch_and_bound::methods},
     {"cholesky", cholesky::methods},
     {"dissection", dissection::methods},
     {"halpern", halpern::methods},
     {"interior_point", interior_point::methods},
+    {"likelihood_field", likelihood_field::methods},
     {"noise", noise::methods},
     {"ordering", ordering::methods},
     {"poses", poses::methods},
     {"prediction", prediction::methods},
-    {"scans", scans::methods},
+    {"ray_casting", ray_casting::methods},
+    {"scan_matching", scan_matching::methods},
+    {"scan_points", scan_points::methods},
     {"se2", se2::methods},
     {"se3", se3::methods},
     {"spanning_tree", spanning_tree::methods},
     {"substitution", substitution::methods},
     {"symbolic", symbolic::methods},
+    {"voxel_grid", voxel_grid::methods},
 };
 constexpr size_t PARTS = sizeof parts / sizeof *parts;
 

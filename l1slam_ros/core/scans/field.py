@@ -14,14 +14,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.scans import kernels
-from l1slam_ros.core.scans.search_kernels import ACROSS, WIDTH
 
 Likelihoods = NDArray[np.uint8]
 # [m] Cells of the look-up, and how far it reaches.
 RESOLUTION, REACH = 0.1, 0.6
-# The widest bound of a search is over 2^_HEIGHT cells each way.
+# The widest bounds of a search are over so many cells each way, and it has at most so many of them
+# each way; as `native.branch_and_bound` has them.
+WIDTH, ACROSS = 8, 32
 _HEIGHT = WIDTH.bit_length() - 1
 # A likelihood of 1.
 CERTAIN = 255
@@ -53,7 +54,7 @@ class Field:
         shape = np.ceil((xy.max(axis=0) - origin + REACH) / RESOLUTION).astype(np.int64)
         xy = np.ascontiguousarray(xy)
         nearest, square = np.full(shape, -1, np.int32), np.full(shape, REACH**2)
-        kernels.nearest_points(xy, origin, RESOLUTION, REACH, nearest, square)
+        native.likelihood_field.nearest_points(xy, origin, RESOLUTION, REACH, nearest, square)
         return Field(xy, np.ascontiguousarray(normals), nearest, square, origin)
 
     @cached_property

@@ -19,27 +19,11 @@ from functools import cached_property
 
 import numpy as np
 
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.scans import kernels
 
-# [m] Points are at least so far apart along a scan.
-SPACING = 0.05
-# [m] A normal is of the line through neighbours within so much; RMS distance to that line.
-_NORMAL_REACH, _OFF_LINE = 0.25, 0.03
-# The same by the noise of the ranges, and the most that is taken for noise [m].
-_REACH_OF_NOISE = 8.0
-_OFF_OF_NOISE = 1.5
-_MOST_NOISE = 0.08
-# Of second differences the lower quartile, which corners and stray rays do not reach; by how much
-# it is less than the noise, where that is normal.
-_SMOOTH = 0.25
-_OF_SMOOTH = 0.3186 * 6.0**0.5
-# Far away rays are wide apart: neighbours within so many rays' distance.
-_RAYS = 10.0
-# Of fewer rays that are as near to each other as points may be, nobody can tell their noise.
-_FEWEST = 20
 # Bearings of a view.
 _BEARINGS = 720
 
@@ -120,45 +104,20 @@ def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
     velocity : (3,) of the robot while it scanned, in its own frame [m/s, m/s, rad/s]: each ray is
     moved to where its point lies from the robot at the scan's stamp
     """
-    ranges = np.asarray(scan.ranges, float)
+    ranges = np.ascontiguousarray(scan.ranges, float)
     turn = -1.0 if mount.upside_down else 1.0
     ray = np.arange(0.0, len(ranges))
     angles = mount.yaw + turn * (scan.angle_min + scan.angle_increment * ray)
-    looked = ~np.isnan(ranges) & (ranges > max(scan.range_min, 0.0))
-    hit = looked & (ranges < scan.range_max)
-    reach = np.where(hit, ranges, 0.0)
-    xy = np.stack((mount.x + reach * np.cos(angles), mount.y + reach * np.sin(angles)), axis=1)
-    centre = np.array([mount.x, mount.y])
+    reach = np.where(np.isfinite(ranges), ranges, 0.0)
+    ends = np.stack((mount.x + reach * np.cos(angles), mount.y + reach * np.sin(angles)), axis=1)
     if velocity is not None and scan.time_increment:
-        xy = _at_stamp(xy, velocity, scan.time_increment * np.arange(0.0, len(ranges)))
-    view = _view(np.where(hit, ranges, np.inf)[looked], angles[looked])
-    noise = _noise(reach, hit, abs(scan.angle_increment))
-    widest = max(_NORMAL_REACH, _REACH_OF_NOISE * noise)
-    widening = _RAYS * abs(scan.angle_increment)
-    lone = _lone(xy[hit], np.maximum(widest, widening * reach[hit]))
-    seen, stray = xy[hit][~lone], xy[hit][lone]
-    normals = np.zeros_like(seen)
-    count = kernels.surface_along(
-        seen, centre, SPACING, widest, widening, max(_OFF_LINE, _OFF_OF_NOISE * noise),
-        np.empty_like(seen), normals)
-    return Points(np.concatenate((seen[:count], stray)),
-                  np.concatenate((normals[:count], np.zeros_like(stray))), centre, view)
-
-
-def _lone(xy: Array, reach: Array) -> Mask:
-    """
-    Return which points (n, 2) in a row hang together with neither neighbour.
-
-    They are of no surface, and what is on both sides of one may be: rays that go through glass, or
-    end anywhere, would cut walls to pieces, too short for a normal.
-
-    reach : (n,) within which neighbours are [m]; half as far they hang together, as on a surface
-    """
-    way = np.hypot(*np.diff(xy, axis=0).T)
-    alone = np.full((2, len(xy)), True)
-    alone[0, 1:] = way > 0.5 * reach[1:]
-    alone[1, :-1] = way > 0.5 * reach[:-1]
-    return alone[0] & alone[1]
+        ends = _at_stamp(ends, velocity, scan.time_increment * ray)
+    bearings = np.floor(angles / (2 * np.pi) * _BEARINGS).astype(np.int64) % _BEARINGS
+    centre = np.array([mount.x, mount.y])
+    xy, normals, view = native.scan_points.points_of(
+        ends, ranges, angles, bearings, _BEARINGS, max(scan.range_min, 0.0), scan.range_max,
+        abs(scan.angle_increment), centre)
+    return Points(xy, normals, centre, view)
 
 
 def _at_stamp(xy: Array, velocity: Array, seconds: Array) -> Array:
@@ -168,43 +127,6 @@ def _at_stamp(xy: Array, velocity: Array, seconds: Array) -> Array:
     x = c * xy[:, 0] - s * xy[:, 1] + velocity[0] * seconds
     y = s * xy[:, 0] + c * xy[:, 1] + velocity[1] * seconds
     return np.stack((x, y), axis=1)
-
-
-def _noise(ranges: Array, hit: Mask, increment: float) -> float:
-    """Return the standard deviation of ranges, by how far they are off their neighbours [m]."""
-    off = np.abs(ranges[:-2] - 2 * ranges[1:-1] + ranges[2:])
-    dense = ranges[1:-1] * increment < SPACING
-    off = off[hit[:-2] & hit[1:-1] & hit[2:] & dense]
-    if len(off) < _FEWEST:
-        return 0.0
-    least = np.partition(off, int(_SMOOTH * len(off)))[int(_SMOOTH * len(off))]
-    return min(float(least) / _OF_SMOOTH, _MOST_NOISE)
-
-
-def _view(ranges: Array, angles: Array) -> Array:
-    """Return the least range in each bearing; see `Points`."""
-    view = np.full(_BEARINGS, np.nan)
-    at = np.floor(angles / (2 * np.pi) * _BEARINGS).astype(np.int64) % _BEARINGS
-    np.fmin.at(view, at, ranges)
-    # A bearing between two rays is seen by both: so far as the nearer one.
-    steps = np.arange(1, 1 + int(_BEARINGS * _spacing_of(angles) / (2 * np.pi) + 1e-6))
-    between = np.flatnonzero(np.isnan(view))
-    view[between] = np.minimum(_first_seen(view, between[:, None] - steps),
-                               _first_seen(view, between[:, None] + steps))
-    return view
-
-
-def _first_seen(view: Array, bearings: Indices) -> Array:
-    """Return of each row of bearings (n, k) the range in the first that is seen, NaN: of none."""
-    if not bearings.shape[1]:
-        return np.full(len(bearings), np.nan)
-    ranges = view[bearings % _BEARINGS]
-    first = np.isnan(ranges).argmin(axis=1)
-    return ranges[np.arange(len(ranges)), first]
-
-
-def _spacing_of(angles: Array) -> float:
-    return float(np.median(abs(np.diff(angles)))) if len(angles) > 1 else 0.0
 
 
 def have_normal(normals: Array) -> Mask:

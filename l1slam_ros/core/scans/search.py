@@ -15,12 +15,10 @@ Branch and bound over shifts and turns (Hess et al. 2016), on the likelihood of 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.scans import search_kernels
-from l1slam_ros.core.scans.field import CERTAIN, RESOLUTION, Field
-from l1slam_ros.core.scans.search_kernels import ACROSS, FEW, WIDTH
+from l1slam_ros.core import native
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans.field import ACROSS, CERTAIN, RESOLUTION, WIDTH, Field
 
 # [rad] Step of the turns: at 4 m a cell.
 TURN = 0.025
@@ -50,40 +48,20 @@ def search(field: Field, xy: Array, centre: Array, reach: float, turn: float, le
     if not len(xy) or not len(field.xy):
         return None
     points = xy[np.linspace(0, len(xy) - 1, min(len(xy), _MOST_POINTS)).astype(np.int64)]
-    certain = CERTAIN * len(points)
     turns = np.arange(-int(turn / TURN), int(turn / TURN) + 1) * TURN + centre[2]
     most = int(reach / RESOLUTION)
-    across = 2 * most // WIDTH + 1
-    if across > ACROSS:
+    if 2 * most >= WIDTH * ACROSS:
         raise ValueError(f'a search reaches {WIDTH * ACROSS * RESOLUTION / 2} m at most')
     # Where the points would be without a turn at the lowest shift, in cells of the levels.
     start = (centre[:2] - field.origin) / RESOLUTION + WIDTH - most
-    sums = np.zeros((len(turns), across, ACROSS if across > FEW else FEW), np.uint16)
-    cells = np.empty((len(turns), len(points), 2), np.int32)
-    search_kernels.add_widest_bounds(
-        field.blocks, np.ascontiguousarray(points / RESOLUTION),
-        np.column_stack((np.cos(turns), np.sin(turns))), start, sums, cells)
-    stack = np.empty((4 * len(field.levels), 5), np.int64)
-    nodes = _sorted(sums[:, :, :across], rival * least * certain)
-    best, at, column, row = search_kernels.branch_and_bound(
-        field.levels, cells, nodes, 2 * most, int(least * certain), np.full(6, -1.0),
-        stack)
+    certain = CERTAIN * len(points)
+    # Around a peak so many turns, which begin anew after a whole one, and cells are the same one.
+    same = np.array([_SAME_TURN / TURN, _SAME / RESOLUTION, 2 * np.pi / TURN])
+    best, at, column, row, second = native.branch_and_bound.search(
+        field.levels, field.blocks, points / RESOLUTION,
+        np.column_stack((np.cos(turns), np.sin(turns))), start, 2 * most, least * certain, rival,
+        same)
     if at < 0:
         return None
-    around = np.array([at, column, row, _SAME_TURN / TURN, _SAME / RESOLUTION,
-                       2 * np.pi / TURN])
-    second, other, *_ = search_kernels.branch_and_bound(
-        field.levels, cells, nodes, 2 * most, int(rival * best), around, stack)
     shift = RESOLUTION * (np.array([column, row]) - most)
-    return Peak(np.array([*(centre[:2] + shift), turns[at]]), best / certain,
-                second / certain if other >= 0 else 0.0)
-
-
-def _sorted(bounds: NDArray[np.uint16], least: float) -> Indices:
-    """Return turn, column, row and bound of the squares above `least`, (k, 4), the best first."""
-    above = np.flatnonzero(bounds > least)
-    found = bounds.ravel()[above]
-    # Numbers of 16 bits are sorted by their digits, ten times as fast as others.
-    order = np.argsort(~found, kind='stable')
-    t, a, b = np.unravel_index(above[order], bounds.shape)
-    return np.column_stack((t, WIDTH * a, WIDTH * b, found[order])).astype(np.int64)
+    return Peak(np.array([*(centre[:2] + shift), turns[at]]), best / certain, second / certain)

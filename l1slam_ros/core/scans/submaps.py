@@ -15,11 +15,11 @@ from functools import cached_property
 
 import numpy as np
 
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.field import Field
-from l1slam_ros.core.scans.points import Points, have_normal, transformed, turn
+from l1slam_ros.core.scans.points import Points, transformed
 
 # A submap is of so many keyframes before and after its own.
 AROUND = 4
@@ -100,22 +100,11 @@ def submap_of(keyframes: Sequence[Keyframe], at: int, before: int = AROUND, afte
     poses = se2.between(np.tile(own.pose, (len(near), 1)), np.array([k.pose for k in near]))
     seen = np.concatenate([keyframe.points.xy for keyframe in near])
     normal = np.concatenate([keyframe.points.normals for keyframe in near])
-    end = 0
-    for keyframe, pose in zip(near, poses, strict=True):
-        of = slice(end, end := end + len(keyframe.points.xy))
-        R = turn(pose[2])
-        seen[of] = seen[of] @ R + pose[:2]
-        normal[of] = normal[of] @ R
-    has = have_normal(normal)
-    points, normal = seen[has], normal[has]
+    counts = np.array([len(keyframe.points.xy) for keyframe in near])
     # Of the points of a cell the first is kept, which is of the oldest scan.
-    side = np.round(np.arctan2(normal[:, 1], normal[:, 0]) / (np.pi / 2)).astype(np.int64) % 4
-    cell = np.floor(points / _CELL).astype(np.int64)
-    # One number for each cell and side; no map is 2^29 cells wide.
-    _, first = np.unique((cell[:, 0] * 2**31 + cell[:, 1]) * 4 + side, return_index=True)
-    kept = np.sort(first)
+    points, normals = native.voxel_grid.merge(seen, normal, counts, poses, _CELL)
     centres = np.array([[*keyframe.points.centre, 0.0] for keyframe in near])
-    return Submap(points[kept], normal[kept], np.stack([k.points.view for k in near]),
+    return Submap(points, normals, np.stack([k.points.view for k in near]),
                   se2.compose(poses, centres))
 
 
@@ -132,8 +121,7 @@ def seen_by(viewer: Submap, seen: Submap, pose: Array) -> tuple[int, int]:
     The latter are where the viewer's rays pass through; where it did not look, none are counted.
     """
     points = np.ascontiguousarray(transformed(pose, seen.xy))
-    agree, through = kernels.contradictions(points, viewer.views, viewer.centres, _PAST)
-    return int(agree), int(through)
+    return native.ray_casting.contradictions(points, viewer.views, viewer.centres, _PAST)
 
 
 class Submaps:

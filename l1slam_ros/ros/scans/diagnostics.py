@@ -79,8 +79,6 @@ class ScanDiagnostics:
                 f'{count} {_SAID.get(cause, cause)}' for cause, count in sorted(lately.items())))
         if (sources := self._topics['odom'].publishers()) > 1:
             wrong.append(f'odom has {sources} publishers; expected one')
-        if not self._front_end.ready:
-            wrong.append('compiling, once on a machine')
         missing = [topic for topic in ('scan', 'odom', 'path')
                    if not self._topics[topic].publishers()]
         if missing:

@@ -26,7 +26,6 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.front_end import ScanFrontEnd
 from l1slam_ros.core.scans.odometry import Step
 from l1slam_ros.core.scans.points import Mount, Scan
-from l1slam_ros.io.compilation import SCANS, fill_cache, make_ready
 from l1slam_ros.io.messages.conversion import odometry_in
 from l1slam_ros.ros.scans.map_drawer import MapDrawer
 from l1slam_ros.ros.scans.messages import covariance_in, path_in, scan_in
@@ -184,7 +183,6 @@ class FrontEndThread:
     refused : cause -> number of messages that could not be used
     queue : the scans that wait
     run : the matching of scans
-    ready : whether the compiled loops are ready
 
     """
 
@@ -196,7 +194,6 @@ class FrontEndThread:
         self._frames = RobotFrames(options, self._logger, static)
         self.refused = Counter[str]()
         self.queue = ScanQueue(lambda: options().backlog)
-        self.ready = False
         self._restarts = self.queue.restarts
         self.run = RunOfScans(options, self._frames, publisher, drawer, self._logger)
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=_BACKLOG)
@@ -223,13 +220,6 @@ class FrontEndThread:
         return not self._thread.is_alive()
 
     def _work(self) -> None:
-        try:
-            fill_cache(lambda done, total: None, lambda: self._closing, SCANS)
-            for step in SCANS if not self._closing else ():
-                make_ready(step)
-        except Exception as error:  # what is missing is compiled when it is first called
-            self._failures.note('compiling', error)
-        self.ready = True
         more = False
         while not self._closing:
             self._woken.wait(0.0 if more else _LOOK)

@@ -21,15 +21,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.points import Points, transformed
 
 # Log odds that one ray adds, and the most that all do.
-_FREE = np.float32(0.4)
-_OCCUPIED = np.float32(0.85)
-_MOST = np.float32(100.0)
+_FREE = 0.4
+_OCCUPIED = 0.85
+_MOST = 100.0
 # Cells above, and below, are occupied and free: probabilities .65 and .25, as nav2's map saver
 # has them.
 OCCUPIED, FREE = np.log(0.65 / 0.35), np.log(0.25 / 0.75)
@@ -75,7 +75,8 @@ def draw(points: Sequence[Points], poses: Array, resolution: float = 0.05) -> Gr
     shape = np.ceil((high - low) / resolution).astype(int) + 1
     log_odds = np.zeros((int(shape[0]), int(shape[1])), np.float32)
     for start, end, hit in rays:
-        kernels.cast_rays(log_odds, low, resolution, start, end, hit, _FREE, _OCCUPIED, _MOST)
+        native.ray_casting.cast_rays(
+            log_odds, low, resolution, start, end, hit, _FREE, _OCCUPIED, _MOST)
     return Grid(log_odds, low, resolution)
 
 

@@ -16,14 +16,13 @@ float of 32 bits sums exactly up to two millions, and there is no bound.
 
 import numpy as np
 
+from l1slam_ros.core import native
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.occupancy.grid import Grid, rays_of
 from l1slam_ros.core.scans.points import Points
 
 # Log odds that one ray adds, in eighths.
-_FREE, _OCCUPIED = np.float32(0.375), np.float32(0.875)
-_UNBOUNDED = np.float32(np.inf)
+_FREE, _OCCUPIED = 0.375, 0.875
 # [m] The grid grows by so much at once.
 _MARGIN = 10.0
 # [m] A keyframe is drawn anew where it moves what is so far away by half a cell.
@@ -88,8 +87,9 @@ class LiveGrid:
         low = np.minimum(ends.min(axis=0), starts[0])
         high = np.maximum(ends.max(axis=0), starts[0])
         self._reach(low, high)
-        kernels.cast_rays(self._log_odds, self._origin, self._resolution, starts, ends, hits,
-                          sign * _FREE, sign * _OCCUPIED, _UNBOUNDED)
+        native.ray_casting.cast_rays(
+            self._log_odds, self._origin, self._resolution, starts, ends, hits, sign * _FREE,
+            sign * _OCCUPIED, np.inf)
 
     def _reach(self, low: Array, high: Array) -> None:
         """Let the grid reach from one corner to another [m]."""
