@@ -228,6 +228,9 @@ template <class R, class... Ts, R (*F)(Ts...), bool BRIEF> struct Function<F, BR
         } catch (const std::bad_alloc&) {
             if (state) PyEval_RestoreThread(state);
             return PyErr_NoMemory();
+        } catch (const std::length_error&) {  // a vector of more than there can be
+            if (state) PyEval_RestoreThread(state);
+            return PyErr_NoMemory();
         }
     }
 };
