@@ -10,6 +10,7 @@
 
 import importlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -53,13 +54,14 @@ def test_the_best_level_is_taken_unless_one_is_asked_for():
 
 @pytest.mark.parametrize('code, variables, said', [
     (LEVEL, {'L1SLAM_ROS_SIMD': 'sse'},
-     "ImportError: L1SLAM_ROS_SIMD is 'sse'; expected one of avx2, portable"),
-    (HIDDEN + LEVEL, {'L1SLAM_ROS_SIMD': ''}, 'ImportError: l1slam_ros.core.native._portable is '
-     'not built for this Python; `pip install .` or `colcon build` does it, with a C++17 compiler '
-     'and the headers of Python (apt install g++ python3-dev)')], ids=['no level', 'not built'])
+     "L1SLAM_ROS_SIMD is 'sse'; expected one of avx2, portable"),
+    (HIDDEN + LEVEL, {'L1SLAM_ROS_SIMD': ''}, r'the compiled core does not load \(import of .* '
+     r'halted.*\); `pip install .` or `colcon build` builds it, with a C\+\+17 compiler and the '
+     r'headers of Python \(apt install g\+\+ python3-dev\)')], ids=['no level', 'not built'])
 def test_what_cannot_be_loaded_is_one_sentence(code, variables, said):
     done = ran('-c', code, **variables)
-    assert done.returncode == 1 and done.stderr.splitlines()[-1] == said
+    assert done.returncode == 1
+    assert re.fullmatch(rf'l1slam_ros\.core\.errors\.\w+: {said}', done.stderr.splitlines()[-1])
 
 
 @pytest.fixture(params=native_calls.modules())
