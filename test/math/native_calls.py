@@ -24,7 +24,7 @@ import numpy as np
 
 from l1slam_ros.core import native
 
-_ARRAY = re.compile(r'a C-contiguous (writable )?(\w+) array of (\d) dimensions')
+_ARRAY = re.compile(r'a (?:C-contiguous )?(?:writable )?(\w+) array of (\d) dimensions')
 _SIZES = (0, 1, 2, 3, 4, 6, 7)
 # Of a kind each: what may be handed in in place of a number.
 _NUMBERS = {'a number': (0.0, 1.0, -1.0, 1e300, np.nan, np.inf, 3, '1', None),
@@ -81,7 +81,7 @@ def expected(function):
 
 def array(kind, sizes):
     """Return an array that is what an error says is expected, of zeros."""
-    _, dtype, dimensions = _ARRAY.match(kind).groups()
+    dtype, dimensions = _ARRAY.match(kind).groups()
     return np.zeros(sizes[:int(dimensions)], dtype)
 
 
@@ -91,7 +91,7 @@ def argument(kind, rng, sizes):
 
     Arrays of whole numbers hold zeros: not every function checks each index in them.
     """
-    if not kind:
+    if kind not in _NUMBERS and not _ARRAY.match(kind):
         dtype, dimensions = rng.choice(['float64', 'int64']), rng.integers(1, 4)
         kind = rng.choice([*_NUMBERS, f'a C-contiguous {dtype} array of {dimensions} dimensions'])
     if not _ARRAY.match(kind):
