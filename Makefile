@@ -21,7 +21,7 @@ unexport PYTHONDONTWRITEBYTECODE
 define install
 	@echo '$(1)'
 	@touch $(HALF)
-	@quiet=; test -t 1 || quiet=--quiet; PYTHONWARNINGS=ignore \
+	@quiet=; test -t 1 || quiet=--quiet; PYTHONWARNINGS=ignore PIP_DISABLE_PIP_VERSION_CHECK=1 \
 	  $(VENV)/bin/python -m pip install $$quiet $(2) || \
 	  { test $$? -ge 128 || rm $(HALF); exit 1; }
 endef
