@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-# Needs Python >= 3.10 and make; everything else goes into .venv.
+# Needs Python >= 3.10 with its headers and make; everything else goes into .venv.
 
 PYTHON ?= python3
 VENV := .venv
-# What there is so far: what the demo needs, and on top of it what the tests need.
+# What there is so far: the compiled core, on top of it what the demo needs, and the tests.
+CORE := $(VENV)/compiled
 STAMP := $(VENV)/installed
 TESTS := $(VENV)/installed-tests
 # Is there while packages are being installed. What an interrupted pip leaves half done it takes
@@ -20,7 +21,7 @@ unexport PYTHONDONTWRITEBYTECODE
 define install
 	@echo '$(1)'
 	@touch $(HALF)
-	@quiet=; test -t 1 || quiet=--quiet; PYTHONWARNINGS=ignore \
+	@quiet=; test -t 1 || quiet=--quiet; PYTHONWARNINGS=ignore PIP_DISABLE_PIP_VERSION_CHECK=1 \
 	  $(VENV)/bin/python -m pip install $$quiet $(2) || \
 	  { test $$? -ge 128 || rm $(HALF); exit 1; }
 endef
@@ -35,19 +36,29 @@ test: $(TESTS)
 	$(VENV)/bin/python -m pytest -n 3 --dist worksteal
 
 clean:
-	rm -rf $(VENV) build demo dist install log *.egg-info
+	rm -rf $(VENV) build demo dist install log *.egg-info l1slam_ros/core/native/*.so
 	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis
 
+METADATA := setup.py setup.cfg pyproject.toml package.xml
+
 # Editable, so that every process, whoever starts it, runs the checkout.
-$(STAMP): setup.py setup.cfg pyproject.toml package.xml $(if $(wildcard $(HALF)),anew)
+$(CORE): $(METADATA) build_backend.py $(wildcard l1slam_ros/core/native/*.[ch]pp) \
+		$(if $(wildcard $(HALF)),anew)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2> /dev/null || { echo \
 	  '$(PYTHON) is no Python 3.10 or newer; expected one: make PYTHON=python3.12' >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2> /dev/null || { echo \
 	  '$(PYTHON) makes no environments; expected its venv: apt install python3-venv' >&2; exit 1; }
+	@$(PYTHON) -c 'from sysconfig import *; open(get_path("include") + "/Python.h")' \
+	  2> /dev/null || { echo \
+	  '$(PYTHON) has no headers; expected its Python.h: apt install python3-dev' >&2; exit 1; }
 	@if test -e $(HALF) || ! $(VENV)/bin/python -m pip --version > /dev/null 2>&1; then \
 	  echo 'Making a Python environment in $(VENV)'; \
 	  rm -rf $(VENV) && mkdir $(VENV) && touch $(HALF) && $(PYTHON) -m venv $(VENV); fi
-	$(call install,Installing what the demo needs; the first time it is downloaded,--editable '.[ros]')
+	$(call install,Compiling the core; if there is no compiler it is downloaded,--no-deps --editable .)
+	@rm $(HALF) && touch $@
+
+$(STAMP): $(METADATA) $(if $(wildcard $(HALF)),anew) | $(CORE)
+	$(call install,Installing what the demo needs; the first time it is downloaded,'l1slam_ros[ros]')
 	@rm $(HALF) && touch $@
 
 # An editable install leaves the data files out, so they are put in place by a command of their

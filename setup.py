@@ -8,14 +8,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package's metadata; the version is that of package.xml, a test compares the rest with it."""
 
-import platform
 import sys
 from glob import glob
 from pathlib import Path
 from xml.etree import ElementTree
 
-import numpy
-from setuptools import Extension, find_packages, setup
+from setuptools import find_packages, setup
+
+# `colcon build --symlink-install` runs a link to this file, in a folder without what lies here.
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from build_backend import HERE, BuildCore, extensions
 
 package_name = 'l1slam_ros'
 
@@ -30,49 +33,25 @@ data_files = [
 if not {'install', 'develop'}.intersection(sys.argv):
     data_files.append((f'lib/{package_name}', sorted(glob('resource/run/*'))))
 
-# `colcon build --symlink-install` runs a link to this file, in a folder without these.
-readme, manifest = (Path(__file__).resolve().with_name(n) for n in ('README.md', 'package.xml'))
-
-# The compiled core, once for each level of processors; `native/__init__.py` takes the best that
-# runs. Sums may be reordered, which is what lets them be vectorised; NaN and infinity keep their
-# meaning. One file serves every Python from 3.10 on.
-NATIVE = f'{package_name}/core/native'
-LEVELS = {'portable': []}
-if platform.machine().lower() in ('x86_64', 'amd64'):
-    LEVELS['avx2'] = ['-march=x86-64-v3']
-extensions = [
-    Extension(
-        f'{NATIVE.replace("/", ".")}._{level}',
-        [f'{NATIVE}/{level}.cpp'],
-        include_dirs=[numpy.get_include()],
-        depends=sorted(glob(f'{NATIVE}/*.hpp')),
-        define_macros=[('Py_LIMITED_API', '0x030A0000'), ('NDEBUG', None)],
-        extra_compile_args=[
-            '-std=c++17', '-O3', '-g0', '-fvisibility=hidden', '-ffp-contract=fast',
-            '-fno-math-errno', '-fno-trapping-math', '-fno-signed-zeros', '-fassociative-math',
-            *flags,
-        ],
-        py_limited_api=True,
-    ) for level, flags in LEVELS.items()
-]
-
 setup(
     name=package_name,
-    version=ElementTree.parse(manifest).findtext('version'),
+    version=ElementTree.parse(HERE / 'package.xml').findtext('version'),
     description='Pose-graph SLAM back end for ROS 2: L1 norm, primal-dual, robust to false loops',
-    long_description=readme.read_text(encoding='utf-8'),
+    long_description=(HERE / 'README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     maintainer='l1slam_ros maintainers',
     maintainer_email='maintainers@l1slam-ros.invalid',
     license='Apache-2.0',
     packages=find_packages(exclude=['test']),
-    ext_modules=extensions,
-    options={'bdist_wheel': {'py_limited_api': 'cp310'}},
+    ext_modules=extensions(),
+    cmdclass={'build_ext': BuildCore},
+    options={'bdist_wheel': {'py_limited_api': 'cp310'}, 'build_ext': {'parallel': 2}},
     # Said though it is so anyway: then an editable install is a path, which type checkers follow,
     # and not a hook of the import, which they do not.
     package_dir={'': '.'},
     package_data={
         package_name: ['py.typed'],  # its annotations are there to be used
+        f'{package_name}.core.native': ['*.pyi'],
         f'{package_name}.cli.report': ['page.html'],
     },
     data_files=data_files,

@@ -14,6 +14,8 @@
 # A key that ends with -pip has a rule for pip alone, which bloom refuses.
 OF_ROSDEP = {
     'python3-argcomplete': 'python3-argcomplete',
+    # Looked up in the older copy alone, where it is the same for all releases.
+    'python3-dev': 'python3-dev',
     'python3-hypothesis': 'python3-hypothesis',
     'python3-matplotlib': 'python3-matplotlib',
     # The older copy names Bionic and Focal alone; the newer one, all releases.

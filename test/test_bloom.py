@@ -65,4 +65,5 @@ def test_bloom_makes_a_debian_package_of_every_key(index, tmp_path):
     assert 'Maintainer: "l1slam_ros maintainers"' in control
     needed = {word.strip(' ,') for line in control.splitlines() for word in line.split(', ')}
     assert 'is doubtful' in (copy / 'debian' / 'changelog').read_text()
-    assert {PACKAGES[key] for key in ('rclpy', 'nav_msgs', 'python3-numpy')} <= needed
+    wanted = ('rclpy', 'nav_msgs', 'python3-dev', 'python3-numpy')
+    assert {PACKAGES[key] for key in wanted} <= needed

@@ -27,7 +27,8 @@ ROS = {
 # From the ground up; what shares a floor does not know of each other. Errors, options and names
 # stand beside the building: all may use them, and they use nothing.
 FLOORS = (
-    ('core.kernels',), ('core.geometry',), ('core.graph', 'core.scans'), ('core.solvers',),
+    ('core.native', 'core.kernels'), ('core.geometry',), ('core.graph', 'core.scans'),
+    ('core.solvers',),
     ('core.robust',), ('core.bordered', 'core.worlds'), ('core.online',), ('core.running',),
     ('io',), ('paper', 'fleet'), ('cli', 'ros'),
 )

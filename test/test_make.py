@@ -11,6 +11,7 @@
 import os
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -25,11 +26,13 @@ test -e "{folder}/$2-$3-fails" && exit 1
 case "$*" in
     *version_info*) test ! -e "{folder}/old" ;;
     *ensurepip*) test ! -e "{folder}/without-venv" ;;
+    *Python.h*) test ! -e "{folder}/without-headers" ;;
     '-m venv '*) mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
 esac
 """
 VENV = '-m venv .venv'
-DEMO = ['-m pip install --quiet --editable .[ros]', '-m l1slam_ros.ros.executables']
+CORE = '-m pip install --quiet --no-deps --editable .'
+DEMO = ['-m pip install --quiet l1slam_ros[ros]', '-m l1slam_ros.ros.executables']
 TEST = ['-m pip install --quiet l1slam_ros[test]', 'setup.py --quiet install_data',
         '-m pytest -n 3 --dist worksteal']
 
@@ -39,7 +42,11 @@ def checkout(tmp_path):
     """Return a checkout whose Python is the one above."""
     folder = tmp_path / 'checkout'
     folder.mkdir()
-    for name in ('Makefile', 'setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml'):
+    native = folder / 'l1slam_ros' / 'core' / 'native'
+    native.mkdir(parents=True)
+    (native / 'se2.hpp').touch()
+    for name in ('Makefile', 'setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml',
+                 'build_backend.py'):
         shutil.copy(ROOT / name, folder)
     python = tmp_path / 'python'
     python.write_text(PYTHON.format(folder=tmp_path))
@@ -61,11 +68,18 @@ def make(checkout, target, python='../python'):
 
 
 def test_the_demo_installs_what_it_needs_once_and_the_tests_only_add_to_it(checkout):
-    assert make(checkout, 'demo')[:2] == (0, [VENV, *DEMO])
+    assert make(checkout, 'demo')[:2] == (0, [VENV, CORE, *DEMO])
     assert make(checkout, 'demo')[:2] == (0, DEMO[1:])
     assert make(checkout, 'test')[:2] == (0, TEST)
     assert make(checkout, 'test')[:2] == (0, TEST[2:])
     assert make(checkout, 'demo')[:2] == (0, DEMO[1:])
+
+
+def test_what_is_compiled_is_compiled_anew_once_its_source_has_changed(checkout):
+    make(checkout, 'test')
+    later = time.time() + 1
+    os.utime(checkout / 'l1slam_ros' / 'core' / 'native' / 'se2.hpp', (later, later))
+    assert make(checkout, 'test')[:2] == (0, [CORE, TEST[-1]])
 
 
 @pytest.mark.parametrize(('target', 'what'), [
@@ -77,7 +91,7 @@ def test_what_was_left_half_done_is_made_anew(checkout, target, what):
     killed.touch()
     assert make(checkout, target)[0]
     killed.unlink()
-    assert make(checkout, 'demo')[:2] == (0, [VENV, *DEMO])
+    assert make(checkout, 'demo')[:2] == (0, [VENV, CORE, *DEMO])
 
 
 def test_where_pip_itself_fails_the_environment_stays(checkout):
@@ -85,13 +99,14 @@ def test_where_pip_itself_fails_the_environment_stays(checkout):
     fails.touch()
     assert make(checkout, 'demo')[0]
     fails.unlink()
-    assert make(checkout, 'demo')[:2] == (0, DEMO)
+    assert make(checkout, 'demo')[:2] == (0, [CORE, *DEMO])
 
 
 @pytest.mark.parametrize(('trouble', 'python', 'said'), [
     ('old', '../python', 'is no Python 3.10 or newer; expected one: make PYTHON=python3.12'),
     ('none', 'no-such-python', 'is no Python 3.10 or newer; expected one: make PYTHON=python3.12'),
     ('without-venv', '../python', 'makes no environments; expected its venv: apt install python3'),
+    ('without-headers', '../python', 'has no headers; expected its Python.h: apt install python3'),
 ])
 def test_a_python_that_will_not_do_is_one_line(checkout, trouble, python, said):
     (checkout.parent / trouble).touch()

@@ -43,7 +43,8 @@ EXECUTABLES = {'backend', 'scan_loops', 'replay', 'l1slam'}
 OF_ROS = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs',
           'rcl_interfaces', 'sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs')
 # EmPy comes without a wheel.
-COLCON = ('colcon-bash', 'colcon-output', 'colcon-ros', 'setuptools<80', '--no-binary=empy')
+COLCON = ('colcon-bash', 'colcon-output', 'colcon-ros', 'numpy', 'setuptools<80',
+          '--no-binary=empy')
 
 # What `l1slam` makes of one small world, run in a folder of its own; by the argument also costs.
 SMOKE = """
@@ -83,8 +84,8 @@ print(json.dumps({
 def source(tmp_path_factory):
     """Return a copy of the checkout, so that nothing is left in it."""
     copy = tmp_path_factory.mktemp('source') / 'l1slam_ros'
-    ignored = shutil.ignore_patterns('.*', '*.egg-info', '__pycache__', 'build', 'install', 'log',
-                                     'dist', 'demo')
+    ignored = shutil.ignore_patterns('.*', '*.egg-info', '*.so', '__pycache__', 'build', 'install',
+                                     'log', 'dist', 'demo')
     return shutil.copytree(ROOT, copy, ignore=ignored, symlinks=True)
 
 
@@ -136,7 +137,8 @@ def test_package_xml_and_setup_py_say_and_need_the_same(metadata, requirements):
     assert manifest.findtext('license') in (metadata['License'], metadata['License-Expression'])
     assert (maintainer.text, maintainer.get('email')) == (
         metadata['Maintainer'], metadata['Maintainer-email'])
-    keys = {element.text for element in manifest.findall('exec_depend')}
+    keys = {element.text for kind in ('depend', 'exec_depend')
+            for element in manifest.findall(kind)}
     only_of_pip = {'rosbags', 'mcap'}  # see test_release.py
     needed = {Requirement(text).name.lower() for text in requirements} - only_of_pip
     assert {'python3-yaml' if name == 'pyyaml' else f'python3-{name}' for name in needed} <= keys
@@ -148,6 +150,12 @@ def test_the_wheel_has_every_module_no_test_and_what_ros_looks_for(wheel):
     assert {name for name in names if name.endswith(('.py', 'py.typed'))
             and '.data/' not in name} == modules | {'l1slam_ros/py.typed'}
     assert 'l1slam_ros/cli/report/page.html' in names
+    # The compiled core in one file for each level, for every Python, and its types; no source.
+    assert '-cp310-abi3-' in Path(wheel.filename).name
+    assert {name for name in names if name.endswith(('.pyi', '.so'))} == {
+        str(path.relative_to(ROOT)) for end in ('pyi', 'so')
+        for path in (ROOT / 'l1slam_ros').rglob(f'*.{end}')}
+    assert not [name for name in names if name.endswith('pp')]
     (licence,) = [name for name in names if name.endswith('/LICENSE')]
     assert wheel.read(licence) == (ROOT / 'LICENSE').read_bytes()
     data = f'{stem(wheel)}.data/data/'
@@ -202,7 +210,7 @@ def damage(cache):
     last.write_bytes(whole)
 
 
-@pytest.mark.parametrize('version', ['3.10', '3.11', '3.12'])
+@pytest.mark.parametrize('version', ['3.10', '3.11', '3.12', '3.13'])
 def test_every_python_makes_the_same_map(wheel, requirements, version, tmp_path):
     """On the oldest one it is solved, too: what that compiles may be damaged later."""
     python = interpreter(version)

@@ -63,7 +63,7 @@ def require(kind: type | tuple[type, ...], name: str, value: object, expected: s
 
 
 class MissingError(L1SlamError):
-    """A library that only some inputs and outputs need, and that is not installed."""
+    """A library that some inputs and outputs need, or the compiled core, is not installed."""
 
 
 # By the first part of a module's name: who may do without, and what brings it.

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 
-from l1slam_ros.core.errors import MissingError, optional_libraries
+from l1slam_ros.core.errors import L1SlamError, optional_libraries
 from l1slam_ros.core.options import Options
 from l1slam_ros.ros.run_backend import leave
 from l1slam_ros.ros.shell.arguments import help_of, split
@@ -77,7 +77,7 @@ def _run(name: str, module: str) -> int:
             print(f'{name}: {sentence}', file=sys.stderr, flush=True)
         with optional_libraries():
             code: int = import_module(f'l1slam_ros.ros.{module}').main()
-    except MissingError as error:
+    except L1SlamError as error:
         print(f'{name}: {error}', file=sys.stderr)
         return _BAD_INPUT
     except ImportError as error:

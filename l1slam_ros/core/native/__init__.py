@@ -18,22 +18,24 @@ import os
 import sys
 from importlib import import_module
 
+from l1slam_ros.core.errors import MissingError, OptionError
+
 LEVELS = ('avx2', 'portable')
 
 
 def _load():
     asked = os.environ.get('L1SLAM_ROS_SIMD', '')
     if asked not in ('', *LEVELS):
-        raise ImportError(f'L1SLAM_ROS_SIMD is {asked!r}; expected one of {", ".join(LEVELS)}')
+        raise OptionError(f'L1SLAM_ROS_SIMD is {asked!r}; expected one of {", ".join(LEVELS)}')
     try:
         portable = import_module(f'{__name__}._portable')
         level = asked or ('avx2' if portable.has_avx2() else 'portable')
         return level, (portable if level == 'portable' else import_module(f'{__name__}._{level}'))
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            f'{error.name} is not built for this Python; `pip install .` or `colcon build` does '
-            'it, with a C++17 compiler and the headers of Python (apt install g++ python3-dev)'
-        ) from error
+    except ImportError as error:
+        raise MissingError(
+            f'the compiled core does not load ({" ".join(str(error).split())}); `pip install .` '
+            'or `colcon build` builds it, with a C++17 compiler and the headers of Python (apt '
+            'install g++ python3-dev)') from error
 
 
 level, _module = _load()

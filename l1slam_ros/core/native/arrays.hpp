@@ -293,6 +293,9 @@ struct Function<F, BRIEF, FEW> {
         } catch (const std::bad_alloc&) {
             if (state) PyEval_RestoreThread(state);
             return PyErr_NoMemory();
+        } catch (const std::length_error&) {  // a vector of more than there can be
+            if (state) PyEval_RestoreThread(state);
+            return PyErr_NoMemory();
         }
     }
 };
