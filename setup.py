@@ -62,7 +62,6 @@ setup(
     install_requires=[
         'numpy>=1.26',
         'scipy>=1.11',
-        'numba>=0.58',
         'matplotlib>=3.6',
         'tqdm>=4.66',
         'PyYAML>=6.0',

@@ -99,11 +99,6 @@ def main() -> None:
     from robust.runs import measure
     from robust.solvers import OURS
 
-    from l1slam_ros.io.compilation import STEPS, make_ready
-
-    # Each run is a copy of this process, which has all loops compiled.
-    for step in STEPS:
-        make_ready(step)
     solvers = [solver for solver in (*OURS, *PEERS)
                if any(word in solver.name for word in arguments.solvers)]
     places: dict[str, Any] = {}

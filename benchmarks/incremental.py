@@ -87,12 +87,9 @@ def main() -> None:
     from updates.cells import Row, commit, is_done, measure
     from updates.tables import document
 
-    from l1slam_ros.io.compilation import IN_SPACE, STEPS, load
     from l1slam_ros.io.files import write_lines
     from l1slam_ros.io.free_memory import give_back_freed_memory
 
-    # Each cell is a copy of this process, which has all loops compiled.
-    load((*STEPS, *IN_SPACE.values()))
     give_back_freed_memory()
     file = arguments.output / 'results' / 'incremental.json'
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -42,11 +42,8 @@ def main() -> None:
 
     from l1slam_ros.core.solvers.block_cholesky import cholesky_of
     from l1slam_ros.core.solvers.seed import first_poses
-    from l1slam_ros.io.compilation import STEPS, make_ready
     from l1slam_ros.io.graphs.graph_file import read_graph_file
 
-    for step in STEPS:
-        make_ready(step)
     record = read_graph_file(file)
     case = Case('large', record.graph, record.poses)
     poses = first_poses(case.graph, cholesky_of(case.graph))

@@ -49,7 +49,6 @@ from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import World, WorldOptions, simulate_world
-from l1slam_ros.io.compilation import STEPS, load
 from l1slam_ros.io.free_memory import give_back_freed_memory
 from l1slam_ros.io.graphs.saved_map import load_map, save_map
 from l1slam_ros.paper.updates import Drive
@@ -89,7 +88,6 @@ def main() -> None:
     parser.add_argument('--rate', type=float, default=50.0, help='of these per second')
     parser.add_argument('--folder', type=Path, help='keeps the map for the next run')
     given = parser.parse_args()
-    load(STEPS)
     give_back_freed_memory()
     with tempfile.TemporaryDirectory() as folder:
         sizes = Sizes(given.poses, given.edges, given.live, given.folder or Path(folder))

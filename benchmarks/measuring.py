@@ -27,7 +27,7 @@ from typing import Any, TypeVar
 
 from l1slam_ros.core.geometry.manifold import Array
 
-_PACKAGES = ('numpy', 'scipy', 'numba', 'gtsam', 'g2opy', 'clarabel', 'highspy', 'ortools')
+_PACKAGES = ('numpy', 'scipy', 'gtsam', 'g2opy', 'clarabel', 'highspy', 'ortools')
 
 Key = TypeVar('Key')
 clock = time.process_time

@@ -181,36 +181,7 @@ def tests_of_lines(folder: Path, tree: Path) -> dict[str, dict[int, set[str]]]:
         lines = runs.setdefault(str(Path(PACKAGE, file.rpartition(f'/{PACKAGE}/')[2])), {})
         for line, tests in data.contexts_by_lineno(file).items():
             lines.setdefault(line, set()).update({*tests} - {''})
-    add_compiled(runs, {path.relative_to(tree).as_posix(): ast.parse(path.read_text())
-                        for path in (tree / PACKAGE).rglob('*.py')})
     return runs
-
-
-def add_compiled(runs: dict[str, dict[int, set[str]]], trees: dict[str, ast.Module]) -> None:
-    """
-    Add the lines of compiled functions, which no tracer sees: run by what runs a line naming them.
-
-    Names stand for functions here: two functions of one name count as one.
-    """
-    compiled = [(file, node) for file, tree in trees.items() for node in ast.walk(tree)
-                if isinstance(node, ast.FunctionDef) and node.decorator_list
-                and not any(runs.get(file, {}).get(line) for statement in node.body
-                            for line in range(statement.lineno, (statement.end_lineno or 0) + 1))]
-    named: dict[str, list[tuple[str, int]]] = {}
-    for file, tree in trees.items():
-        for node in ast.walk(tree):
-            match node:
-                case ast.Name(id=name) | ast.Attribute(attr=name):
-                    named.setdefault(name, []).append((file, node.lineno))
-    while True:  # one compiled function calls another
-        before = sum(len(tests) for lines in runs.values() for tests in lines.values())
-        for file, node in compiled:
-            tests = {test for where, line in named.get(node.name, ())
-                     for test in runs.get(where, {}).get(line, ())}
-            for line in range(node.body[0].lineno, (node.end_lineno or 0) + 1):
-                runs.setdefault(file, {}).setdefault(line, set()).update(tests)
-        if before == sum(len(tests) for lines in runs.values() for tests in lines.values()):
-            return
 
 
 class Trial(NamedTuple):
@@ -267,7 +238,7 @@ def run(tree: Path, mutants: list[Mutant], covered: Path, jobs: int, seconds: in
                 if total > seconds and chosen:
                     break
                 chosen.append(test)
-            variables = environment(copy, NUMBA_CACHE_DIR=str(copy / 'compiled'))
+            variables = environment(copy)
             killer = failing(copy, chosen, 2 * seconds + 60, variables)
             if killer and failing_without(copy, mutant, former, killer, variables):
                 killer = None

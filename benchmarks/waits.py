@@ -38,7 +38,6 @@ import numpy as np
 
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.running.backend import Backend, BackendOptions
-from l1slam_ros.io.compilation import STEPS, load
 from l1slam_ros.io.formats import read_input
 from l1slam_ros.paper.updates import Drive
 
@@ -73,7 +72,6 @@ def main() -> None:
                         help='switch interval of the interpreter, in seconds')
     asked = parser.parse_args()
     sys.setswitchinterval(asked.turn)
-    load(STEPS)
     drive = Drive.of(read_input(asked.datasets / f'{asked.graph}.g2o').graph)
     gc.freeze()  # no robot has all its messages before it moves, to be searched for garbage
     taken = measure(drive, min(asked.poses, drive.keyframes), asked.rate)

@@ -15,7 +15,7 @@ A pose-graph SLAM back end that minimises the L1 norm and refuses loop closures 
     solution = l1.solve(graph)
     l1.write_graph('solved.g2o', graph, solution.poses)
 
-Importing this imports neither ROS nor numba; a name is fetched when it is first used.
+Importing this imports neither ROS nor NumPy; a name is fetched when it is first used.
 """
 
 from importlib import import_module

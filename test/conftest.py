@@ -9,20 +9,14 @@
 """Fixtures every test may ask for."""
 
 import atexit
-import io
 import os
 import signal
 import socket
 import subprocess
-import tempfile
-from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
 import pytest
-from worlds import made
-
-from l1slam_ros.cli.main import main
 
 
 def _own_domain():
@@ -52,17 +46,6 @@ for _name in {*os.environ} - _ABOUT_THE_INSTALLATION:
 os.environ['ROS_DOMAIN_ID'], _mark = _own_domain()
 atexit.register(_mark.close)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-
-
-def pytest_sessionstart(session):
-    """Solve once before the first test: a solve that compiles takes long, and says so."""
-    if hasattr(session.config, 'workerinput') or os.environ.get('NUMBA_DISABLE_JIT'):
-        return
-    capture = session.config.pluginmanager.getplugin('capturemanager')
-    with capture.global_and_fixture_disabled(), tempfile.TemporaryDirectory() as folder:
-        world = made(Path(folder) / 'world.g2o', 30, 45)
-        with redirect_stdout(io.StringIO()):
-            assert main(['solve', str(world), '--solver', 'primal-dual']) == 0
 
 
 def pytest_collection_modifyitems(items):

@@ -212,8 +212,7 @@ class ScanBench(Peer):
             self.listen(kind, topic, qos)
         self.until(lambda: self.scans.get_subscription_count()
                    and self.publishers['/odom'].get_subscription_count(), 'the node subscribes')
-        self.until(lambda: self.scan_status()[1] and 'compiling' not in self.scan_status()[1],
-                   'its loops are compiled')
+        self.until(lambda: self.scan_status()[1], 'it says how it is')
 
     def scan_status(self):
         return self.status('scans')

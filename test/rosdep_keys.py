@@ -18,8 +18,6 @@ OF_ROSDEP = {
     'python3-dev': 'python3-dev',
     'python3-hypothesis': 'python3-hypothesis',
     'python3-matplotlib': 'python3-matplotlib',
-    # The older copy names Bionic and Focal alone; the newer one, all releases.
-    'python3-numba': 'python3-numba',
     'python3-numpy': 'python3-numpy',
     'python3-packaging': 'python3-packaging',
     'python3-pytest': 'python3-pytest',

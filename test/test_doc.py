@@ -137,8 +137,7 @@ def room(folder):
     """
     Return a folder like a fresh checkout, beside its own outputs, and what it is run with.
 
-    Without the package, and with a Python that begins the running one: what is compiled is kept
-    by the paths of both.
+    Without the package, and with a Python that begins the running one.
     """
     for entry in ROOT.iterdir():
         if entry.name not in ('.git', '.venv', 'demo', 'build', 'l1slam_ros'):
@@ -257,7 +256,7 @@ def test_a_recipe_carried_out_as_written_does_what_it_says(heading, said, tmp_pa
 
 def test_sphinx_builds_the_pages_and_finds_every_name(tmp_path):
     """As rosdoc2 does, with the same two tools, and what is only warned of is an error."""
-    tools = environment('sphinx', 'myst-parser', 'numpy', 'scipy', 'numba')
+    tools = environment('sphinx', 'myst-parser', 'numpy', 'scipy')
     built = subprocess.run([tools.prefix / 'bin' / 'sphinx-build', '-q', '-W', '--keep-going',
                             '-d', tmp_path / 'read', ROOT / 'doc', tmp_path / 'html'],
                            capture_output=True, text=True,

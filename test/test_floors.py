@@ -27,8 +27,7 @@ ROS = {
 # From the ground up; what shares a floor does not know of each other. Errors, options and names
 # stand beside the building: all may use them, and they use nothing.
 FLOORS = (
-    ('core.native', 'core.kernels'), ('core.geometry',), ('core.graph', 'core.scans'),
-    ('core.solvers',),
+    ('core.native',), ('core.geometry',), ('core.graph', 'core.scans'), ('core.solvers',),
     ('core.robust',), ('core.bordered', 'core.worlds'), ('core.online',), ('core.running',),
     ('io',), ('paper', 'fleet'), ('cli', 'ros'),
 )
@@ -114,11 +113,10 @@ def test_imports_point_down():
             assert below < number or (below, other_part) == (number, part), f'{module}: {other}'
 
 
-def test_only_the_ros_part_sees_ros_and_only_kernels_see_numba():
+def test_only_the_ros_part_sees_ros():
     for module in FILES:
         seen = {name.split('.')[0] for name in imports(module)}
         assert module in ROS_PART or not seen & ROS, module
-        assert '.kernels.' in module or 'numba' not in seen, module
 
 
 @pytest.mark.parametrize('module', BLIND)

@@ -25,7 +25,7 @@ from worlds import made
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / 'bags' / 'demo'
 BESIDE = Path(sysconfig.get_path('scripts'))
-PATIENCE = 300  # [s] where nothing is compiled yet
+PATIENCE = 300  # [s]
 # What no package of Ubuntu brings, or what not every command needs.
 OPTIONAL = ('rosbags', 'mcap', 'lz4', 'zstandard', 'matplotlib', 'tqdm', 'argcomplete')
 

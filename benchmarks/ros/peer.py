@@ -40,7 +40,7 @@ from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.ros.shell.installed import executable
 
 KINDS = {ODOMETRY_TOPIC: Odometry, LOOP_TOPIC: PoseWithCovarianceStamped}
-PATIENCE = 900.0  # [s] the solver may have to be compiled
+PATIENCE = 900.0  # [s]
 AnyPeer = TypeVar('AnyPeer', bound='Peer')
 
 
@@ -93,7 +93,7 @@ class Peer:
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._hear, 10)
         self.publishers = {topic: self.node.create_publisher(kind, topic, QoSProfile(depth=1000))
                            for topic, kind in KINDS.items()}
-        self.until(lambda: 'compiling' not in self.said.get('message', 'compiling') and all(
+        self.until(lambda: 'message' in self.said and all(
             p.get_subscription_count() for p in self.publishers.values()))
 
     def __enter__(self: AnyPeer) -> AnyPeer:

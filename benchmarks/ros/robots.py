@@ -41,7 +41,7 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 KEYFRAMES, TIMED = 10_000, 500
 ROBOTS, SEEDS = 5, 5
-# Keyframes with an update that is not timed: the first ones link what is compiled.
+# Keyframes with an update that is not timed.
 _WARM = 10
 # An update as often as the node makes one, and no budget: what goes on behind is not waited for.
 _PERIOD, _SECOND = 0.05, 10**9

@@ -48,7 +48,7 @@ from l1slam_ros.ros.shell.installed import executable
 RATE = 40.0
 # Both nodes' parameters.
 _SHIPPED = Path(__file__).parents[2] / 'config' / 'scan_loops.yaml'
-_COMPILING, _END = 60.0, 30.0  # [s] nothing is sent before; the map may change after the last
+_BEGIN, _END = 10.0, 30.0  # [s] nothing is sent before; the map may change after the last
 
 
 def main() -> None:
@@ -85,7 +85,7 @@ def main() -> None:
     nodes = [subprocess.Popen([*within, executable(name), *files, *more]) for name, more in (
         ('scan_loops', ['-p', f"laser_pose:='{mount}'"]), ('backend', ['-r', 'odom:=scan_odom']))]
     try:
-        _listen(node, _COMPILING)
+        _listen(node, _BEGIN)
         before = [cpu_seconds(process.pid) for process in nodes]
         due = time.monotonic()
         for scan, pose in zip(log.scans, log.wheels, strict=True):

@@ -14,10 +14,10 @@ The node on a small computer: one core, and as much memory as a control group al
 
 The node runs as shipped on the first core, in the control groups of the folders GROUPS, joined by
 colons, which have limits and are made beforehand; all others run elsewhere. GRAPH is played to it
-at so many keyframes a second; PARAMS is a params file. Said is how long the start took, which
-compiles the solver unless that was done before, how long updates took until the map that they
-made was published, how late poses were, the processor's time, and the most memory that
-the node had, and the groups with whatever compiled. It ends with 1 where the node was killed.
+at so many keyframes a second; PARAMS is a params file. Said is how long the start took, how long
+updates took until the map that they made was published, how late poses were, the processor's
+time, and the most memory that the node had, and the groups. It ends with 1 where the node was
+killed.
 
 The second form runs any command, with all that it starts, on the first core in these groups, and
 says at the end the most memory that they had.

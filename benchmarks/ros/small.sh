@@ -4,9 +4,8 @@
 #
 #   bash benchmarks/ros/small.sh DATASETS
 #
-# City live at 40 keyframes a second, the Intel log with scans at 40 a second, and the demo from an
-# empty cache, see small.py and scans.py. It ends with 1 where a node or the demo was killed or
-# failed.
+# City live at 40 keyframes a second, the Intel log with scans at 40 a second, and the demo, see
+# small.py and scans.py. It ends with 1 where a node or the demo was killed or failed.
 set -euo pipefail
 data=$(realpath "$1")
 cd "$(dirname "$0")/../.."
@@ -26,11 +25,10 @@ small() {  # the title of a run, and its command, which gets the groups behind i
     rmdir "$memory" "$cpu"
 }
 
-cache=$(mktemp -d)
-trap 'rm -rf "$cache"; rmdir "$memory" "$cpu" 2> /dev/null || true' EXIT
+trap 'rmdir "$memory" "$cpu" 2> /dev/null || true' EXIT
 small 'City, 10,000 keyframes live' "$python" benchmarks/ros/small.py "$data/city10000.g2o" {}
 small 'Intel, with scans' "$python" benchmarks/ros/scans.py \
     "$data/lidar/intel.clf.bz2" "$data/lidar/intel.truth.csv" 40 {}
-NUMBA_CACHE_DIR=$cache small 'the demo' "$python" benchmarks/ros/small.py within {} \
+small 'the demo' "$python" benchmarks/ros/small.py within {} \
     "$python" -m l1slam_ros.ros.executables
 exit "$code"

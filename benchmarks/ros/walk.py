@@ -39,7 +39,6 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
 import l1slam_ros
-from l1slam_ros.io.compilation import STEPS, compile_now
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.ros.node import BackendNode
 from l1slam_ros.ros.shell.domain import go_where_nobody_is
@@ -137,7 +136,6 @@ class Peer:
 
 def walked() -> Walk:
     """Return the walk of a message and a loop through the node."""
-    compile_now(STEPS)
     go_where_nobody_is()  # nobody else's odometry is counted
     rclpy.init()
     walk, executor = Walk(), SingleThreadedExecutor()

@@ -30,7 +30,6 @@ from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import World, WorldOptions, simulate_world
-from l1slam_ros.io.compilation import STEPS, make_ready
 
 
 def solve(world: World) -> dict[str, float]:
@@ -59,8 +58,6 @@ def peak() -> float:
 def main() -> None:
     """Warm up, then solve a world of the size asked for."""
     size = [int(word) for word in sys.argv[1:3]]
-    for step in STEPS:
-        make_ready(step)
     world = simulate_world(size[0], size[1], WorldOptions(), np.random.default_rng(WORLD_SEED))
     before = peak()
     print(json.dumps(solve(world) | {'peak_before': before, 'peak': peak()}))

@@ -24,7 +24,6 @@ from l1slam_ros.core.errors import OptionError
 from l1slam_ros.fleet.batch import FAILED, TABLE, Batch, run
 from l1slam_ros.fleet.child import Values
 from l1slam_ros.fleet.isolated import Limits, failed
-from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now, cores
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import say
@@ -51,15 +50,13 @@ def batch(arguments: argparse.Namespace) -> Ending:
     if arguments.params_file:
         read_params_file(arguments.params_file)  # what is wrong with it is said once
         about['params_file'] = sha256(arguments.params_file.read_bytes()).hexdigest()
-    if not arguments.scheduler:
-        compile_now((*SPARSE, *JUDGEMENT))
     if arguments.params_file:
         words = [*words, '--params-file', os.path.abspath(arguments.params_file)]
     asked = Batch(
         arguments.folder, arguments.output, tuple(words), about,
         Limits(arguments.seconds, int(arguments.memory * _GIGABYTE), arguments.retries),
         arguments.resume is not None, arguments.resume == 'failed')
-    rows = run(asked, solve_one, arguments.workers or cores(), arguments.scheduler)
+    rows = run(asked, solve_one, arguments.workers or _cores(), arguments.scheduler)
     found = Counter(row['status'] for row in rows)
     of_code = Counter(row['exit_code'] for row in rows)
     table = arguments.output / f'{TABLE}.csv'
@@ -71,6 +68,12 @@ def batch(arguments: argparse.Namespace) -> Ending:
         (found[FAILED], 'failed'), (of_code[_READ_IN_PART], 'used only in part')) if count]
     return Ending(f'of {counted(len(rows), "recording")} {" and ".join(parts)}, said in {table}'
                   if parts else '')
+
+
+def _cores() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
+        os.cpu_count() or 1)
 
 
 def _words(arguments: argparse.Namespace) -> list[str]:

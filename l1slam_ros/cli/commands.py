@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, NamedTuple
 from l1slam_ros.cli import summary
 from l1slam_ros.io import formats
 from l1slam_ros.io.bags.topics import Topics
-from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.formats import is_log
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -107,7 +106,6 @@ def read_scan_map(arguments: argparse.Namespace, path: Path, quiet: bool = False
     """Return what the scans of a log, or of a bag's topic, make."""
     from l1slam_ros.io.scans.reading import read_scans
 
-    compile_now((*SPARSE, *JUDGEMENT), quiet)
     with scan_progress(quiet) as report:
         return read_scans(path, arguments.odom_topic, topic, report)
 

@@ -20,7 +20,6 @@ from l1slam_ros.fleet.merging import Merged, Part, apart_sentences, merged, part
 from l1slam_ros.fleet.rivals import rival_doubts
 from l1slam_ros.fleet.scanning import Found, scanned
 from l1slam_ros.io import formats
-from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now
 from l1slam_ros.io.graphs.graph_file import read_graph_file, read_one_of_several
 
 _FEWEST = 2
@@ -52,7 +51,6 @@ def _parts(arguments: argparse.Namespace, paths: list[Path]) -> tuple[list[Part]
     """Return all inputs, and the loops between them that the front end found, if asked to."""
     if arguments.scans is None:
         return [_part(arguments, drive) for drive in _drives(arguments, paths)], None
-    compile_now((*SPARSE, *JUDGEMENT), arguments.quiet)
     with scan_progress(arguments.quiet) as report:
         records, found = scanned(paths, arguments.odom_topic, arguments.scans, report)
     return [Part(path, record) for path, record in zip(paths, records, strict=True)], found

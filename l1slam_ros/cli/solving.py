@@ -30,9 +30,8 @@ from l1slam_ros.core.robust.judgement import NO_WHEELS, doubt_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
-from l1slam_ros.core.solvers.solve import PRIMAL_DUAL, Method
+from l1slam_ros.core.solvers.solve import Method
 from l1slam_ros.io import formats
-from l1slam_ros.io.compilation import DENSE, JUDGEMENT, SPARSE, compile_now, with_space
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.free_memory import free_memory, keep_freed_memory
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -86,7 +85,6 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
     if arguments.plot:
         known_false(arguments.input, record)  # damaged, it is refused before the work
     measure_by(free_memory)
-    compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome, sentences = settled(_outcome(arguments, record, asked))
     if made and not made.has_wheels:
         outcome = _without_wheels(record.graph, outcome)
@@ -182,13 +180,6 @@ def _announce(method: Method, quiet: bool) -> None:
         warn([f'{method.solver}: predicted to take some {method.needs.seconds:.0f} s and '
               f'{in_gigabytes(method.needs.memory)}, of which {in_gigabytes(free())} are free'],
              quiet)
-
-
-def _steps(asked: SolveOptions) -> tuple[str, ...]:
-    """Return what to compile for a solve; a graph that fills in compiles more on its way."""
-    judgement = () if asked.robust is False else JUDGEMENT
-    dense = DENSE if asked.norm == 'l1' and asked.solver == PRIMAL_DUAL else ()
-    return (*SPARSE, *judgement, *dense)
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:

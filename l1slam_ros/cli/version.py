@@ -6,29 +6,22 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The version of l1slam, its commit and its numba, for reports of faults."""
+"""The versions of l1slam, with its commit, of Python and of NumPy, for reports of faults."""
 
 import json
-import os
 import subprocess
 from contextlib import suppress
-from importlib.metadata import Distribution, PackageNotFoundError, distribution, version
+from importlib.metadata import Distribution, distribution, version
 from pathlib import Path
+from platform import python_version
 
 
 def version_text() -> str:
-    """Return one line: the version, the commit where it is known, and the state of numba."""
+    """Return one line: the version, the commit where it is known, Python and NumPy."""
     ours = distribution('l1slam_ros')
     commit = _commit(ours)
-    return f'l1slam {ours.version}{", commit " if commit else ""}{commit}, {_numba()}'
-
-
-def _numba() -> str:
-    try:
-        off = os.environ.get('NUMBA_DISABLE_JIT', '0') != '0'
-        return f'numba {version("numba")}{" switched off by NUMBA_DISABLE_JIT" if off else ""}'
-    except PackageNotFoundError:
-        return 'numba not installed'
+    return (f'l1slam {ours.version}{", commit " if commit else ""}{commit}, '
+            f'Python {python_version()}, NumPy {version("numpy")}')
 
 
 def _commit(ours: Distribution) -> str:

@@ -27,7 +27,6 @@ from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import World, WorldOptions, simulate_world, with_false_loops
 from l1slam_ros.io import formats
-from l1slam_ros.io.compilation import SPARSE, compile_now, with_space
 from l1slam_ros.io.files import put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import beside, pair_lines
@@ -61,7 +60,7 @@ def simulate(arguments: argparse.Namespace) -> Ending:
 
 
 def _scans(world: World, record: GraphRecord, rng: np.random.Generator) -> 'list[Scan]':
-    # It takes numba along, which nothing else here needs.
+    # It takes the compiled core along, which nothing else here needs.
     from l1slam_ros.core.worlds.houses import scans_of_streets
 
     return scans_of_streets(world.truth, record.times, WorldOptions(), rng)
@@ -88,7 +87,6 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
     former = known_false(arguments.input, record)
     believed = record.graph.subset(~former)
     options = LeastSquaresOptions()
-    compile_now(with_space(SPARSE, record.graph.manifold))
     with (formats.named(arguments.input),
           Progress(options.iterations, 'step', label='solving') as progress):
         solution = solve_graph(

@@ -27,7 +27,6 @@ from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io import formats
-from l1slam_ros.io.compilation import STEPS, compile_now
 from l1slam_ros.io.files import new_folder_beside, put_lines, reported, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.ours import REPORT_MARK, refuse_others
@@ -65,7 +64,6 @@ def reproduce(datasets: Path | None, worlds: Sequence[PaperGraph], output: Path,
                           'or --worlds other than none')
     _check_folder(output, force)
     records = read_datasets(datasets) if datasets else {}
-    compile_now(STEPS)
     study = Study(measured(records, worlds, effort), effort)
     with _filling(output) as folder:
         lines = report.head(study)

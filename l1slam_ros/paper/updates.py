@@ -31,7 +31,6 @@ from l1slam_ros.core.running.backend import Backend, BackendOptions, RobustOptio
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.compilation import load
 from l1slam_ros.io.files import invented_stamps
 from l1slam_ros.io.free_memory import give_back_freed_memory
 
@@ -177,7 +176,6 @@ def measure_growth(keyframes: int, rate: float, rng: np.random.Generator,
     The batch, in seconds (k,) at each of the snapshots, is Gauss-Newton on all that has come, from
     the map as it is, ordered anew.
     """
-    load()
     give_back_freed_memory()
     run_updates(Drive.of(_world(_WARM_UP, rng)), None, np.inf, 1)
     graph = _world(keyframes, rng)

@@ -13,8 +13,8 @@
 loops, of those that the recording holds, ten false ones among them, and of the wheels. These and
 `replay` run as processes of their own, with the parameters as shipped, but that the scans of a
 recording that is played fast may wait; this one only listens, as any other ROS program would. It
-counts no seconds, so it works on a busy machine and while loops are compiled: it waits for the
-whole recording to be in the map and for the node to say that nothing changes any more.
+counts no seconds, so it works on a busy machine: it waits for the whole recording to be in the map
+and for the node to say that nothing changes any more.
 """
 
 import signal
@@ -66,7 +66,7 @@ OF_THE_MAP = ('keyframes', 'factors', 'updates', 'l1_cost')
 # The gate leaves out one true loop in a thousand; of which loops, depends on those that the scans
 # add. More than this part of the recorded ones is a fault.
 SUSPECT = 0.01
-# Given up only when nothing has moved for so long [s]; the node can be compiling its solver.
+# Given up only when nothing has moved for so long [s].
 PATIENCE = 120.0
 END = 60.0  # [s] longest that a process may take to end when it is told to
 _INTERRUPTED = 130
@@ -188,7 +188,7 @@ class Listener:
             said = {key: values[key] for key in OF_THE_MAP if key in values}
             if not said:
                 continue
-            # How far it is with compiling is news, but not of the map.
+            # What is wrong is news, but not of the map.
             if status.message != self.heard.sentence:
                 self.heard.sentence, self.moved = status.message, time.monotonic()
             if said != self._said:

@@ -93,7 +93,7 @@ class Diagnostics:
     ----------
     node : whose name and clock it speaks with
     topics : name -> the traffic on it
-    solver : its thread, which may be compiling, or behind
+    solver : its thread, which may be behind
     failures : the failures that last
 
     """
@@ -183,8 +183,6 @@ class Diagnostics:
         judged = rejected + sizes['accepted_loops'] + sizes['suspect_loops']
         if judged >= _FEW and rejected > judged / 2:
             wrong.append(f'{rejected} of {judged} loops are rejected')
-        if self._solver.compiling:
-            wrong.append(f'compiling the solver: {self._solver.compiling}')
-        elif self._solver.behind > _BEHIND:
+        if self._solver.behind > _BEHIND:
             wrong.append(f'loops have not been judged for {self._solver.behind:.0f} s')
         return (DiagnosticStatus.WARN, '; '.join(wrong)) if wrong else (DiagnosticStatus.OK, 'ok')

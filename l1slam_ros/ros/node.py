@@ -74,8 +74,7 @@ class BackendNode(LifecycleNode):
         measure_by(free_memory)
         self._backend = Backend(options, options.dimension)
         self.failures = Failures(self.get_logger(), self.context.ok)
-        self._solver = SolverThread(
-            self._backend, self.failures, self.get_logger(), self._declared)
+        self._solver = SolverThread(self._backend, self.failures, self._declared)
         self._jobs = JobQueue(self, self.failures, self._solver.hurry)
         self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
         if options.load_on_start:

@@ -18,7 +18,6 @@ import re
 import sys
 import types
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 
@@ -54,12 +53,6 @@ def modules():
 def names_of(function):
     """Return the names of the arguments of a function."""
     return [name for name in function.__text_signature__.strip('()').split(', ') if name]
-
-
-def called():
-    """Return the modules that something of the package calls."""
-    texts = [path.read_text() for path in Path(native.__file__).parents[2].rglob('*.py')]
-    return {name for text in texts for name in re.findall(r'\bnative\.(\w+)', text)}
 
 
 def expected(function):

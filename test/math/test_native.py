@@ -67,8 +67,6 @@ def test_what_cannot_be_loaded_is_one_sentence(code, variables, said):
 @pytest.fixture(params=native_calls.modules())
 def module(request):
     """Return the name of each module of the core."""
-    if request.param not in native_calls.called():
-        pytest.skip('nothing calls it yet')
     return request.param
 
 
@@ -150,6 +148,4 @@ def both(monkeypatch):
 def test_both_levels_give_the_same(both, world, arguments, tmp_path):
     graph = made(tmp_path / 'world.g2o', 150, 250, '--world', world, '--false-loops', 5)
     assert main(['solve', str(graph), '--quiet', *arguments]) in (0, 4)
-    if not native_calls.called():
-        pytest.skip('nothing calls the core yet')
-    assert both
+    assert len(both) > 5

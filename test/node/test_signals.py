@@ -16,7 +16,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from node_bench import DEADLINE, Peer, begin, call, pause
+from node_bench import DEADLINE, Peer, begin, call
 from worlds import as_map, made
 
 import l1slam_ros as l1
@@ -68,27 +68,6 @@ def test_while_it_is_being_imported(start, number, first):
     process = start(first=first)
     until(lambda: catches(process, signal.SIGTERM), 'it takes signals')
     assert_ends(process, number)
-
-
-def test_while_it_compiles_all_else_is_served(start, ros, tmp_path):
-    path = tmp_path / 'map.g2o'
-    process = start('--ros-args', '-p', f'save_path:={path}', NUMBA_CACHE_DIR=str(tmp_path))
-    assert 'ready' in process.stderr.readline()
-    b = Peer(ros)
-    b.until_heard()
-    b.drive(0, 4)
-    b.until(lambda: len(b.received['pose']) == 4, 'odometry is answered')
-    assert call(b, 'save').message.startswith('4 keyframes saved')
-    pause(b, False)
-    assert call(b, 'reset').success and call(b, 'load').success
-    waiting = begin(b, 'optimize')
-    b.until(lambda: b.status()[1].startswith('compiling the solver: '), 'it says how far it is')
-    b.drive(4, 6)
-    b.until(lambda: b.count('odom.received') == 6, 'odometry is taken in')
-    assert not waiting.done() and not b.received['path']
-    assert_ends(process, signal.SIGTERM)
-    b.close()
-    assert l1.read_graph(path)[0].n_poses == 6
 
 
 @pytest.fixture(scope='module')

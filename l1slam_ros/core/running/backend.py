@@ -335,7 +335,7 @@ def _before_fork() -> None:
         _at_rest.enter_context(backend.alone(urgent=True))
 
 
-# A forked process inherits locks, but not the threads that hold them, of ours, numba's and
+# A forked process inherits locks, but not the threads that hold them, of ours and
 # Python's. So all background work stops during a fork.
 os.register_at_fork(before=_before_fork, after_in_parent=_at_rest.close,
                     after_in_child=_at_rest.close)

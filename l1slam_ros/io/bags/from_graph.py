@@ -65,7 +65,7 @@ from l1slam_ros.io.graphs.left_out import REJECTED, SLIP, SUSPECT
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.io.messages.serialisation import odometry_bytes, pose_bytes, scan_bytes
 
-if TYPE_CHECKING:  # it takes numba along
+if TYPE_CHECKING:  # it takes the compiled core along
     from l1slam_ros.core.scans.points import Scan
 
 # What `reader.read_note` returns for a graph.

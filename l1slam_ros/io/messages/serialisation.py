@@ -21,7 +21,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.io.files import NANOSECONDS
 
-if TYPE_CHECKING:  # it takes numba along
+if TYPE_CHECKING:  # it takes the compiled core along
     from l1slam_ros.core.scans.points import Scan
 
 _ENCAPSULATION = b'\x00\x01\x00\x00'

@@ -8,15 +8,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thread that updates the map periodically, and goes on after any error of an update."""
 
+import gc
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
 
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.core.running.improve import Improvement
-from l1slam_ros.io.compilation import STEPS, fill_cache, load, with_space
 from l1slam_ros.io.free_memory import give_back_freed_memory
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.parameters import NodeParameters
@@ -24,8 +23,6 @@ from l1slam_ros.ros.threads.failures import Failures
 
 # [s] Pause after a failed update; doubled at each further failure, up to the second number.
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 10.0
-# [s] Compilation that takes less is not logged.
-_WORTH_TELLING = 1.0
 
 
 class SolverThread:
@@ -36,27 +33,24 @@ class SolverThread:
     ----------
     backend : whose map
     failures : records the errors of updates
-    logger : of the node
     parameters : of the node: how often to update, and how long one update may work
 
     """
 
-    def __init__(self, backend: Backend, failures: Failures, logger: Any,
+    def __init__(self, backend: Backend, failures: Failures,
                  parameters: NodeParameters[NodeOptions]):
         self._backend = backend
         self._failures = failures
-        self._logger = logger
         self._parameters = parameters
         self._woken = threading.Event()
         self._paused = self._closing = False
         self._pause = _FIRST_PAUSE
         self._not_before = 0.0
         self._behind_since = 0.0
-        self.compiling = ''
 
     def start(self, tell: Callable[[Improvement | None], None]) -> None:
         """
-        Begin; before the first update, what is not in the cache is compiled.
+        Begin.
 
         tell : publishes what is new; called when an update has taken in what has come, and at its
             end, with what it did, None: nothing
@@ -91,7 +85,11 @@ class SolverThread:
         return time.monotonic() - self._behind_since if self._behind_since else 0.0
 
     def _work(self, tell: Callable[[Improvement | None], None]) -> None:
-        self._compile()
+        # What has been imported stays: some 100,000 objects, each search of which for garbage
+        # would take a tenth of a second.
+        gc.collect()
+        gc.freeze()
+        give_back_freed_memory()
         due = time.monotonic()
         while True:
             # From beginning to beginning: an update is a part of its period.
@@ -130,28 +128,3 @@ class SolverThread:
         if improvement is None or not self._backend.behind().loops:
             self._behind_since = 0.0
         return improvement
-
-    def _compile(self) -> None:
-        began = time.monotonic()
-
-        def report(done: int, total: int) -> None:
-            self.compiling = f'{done} of {total}'
-            if time.monotonic() - began > _WORTH_TELLING:
-                self._logger.info(f'compiling the solver, once on a machine: {self.compiling}')
-
-        try:
-            steps = with_space(STEPS, self._backend.manifold)
-            with self._backend.alone():
-                whole = fill_cache(report, self.is_closing, steps)
-            if whole:
-                load(steps)
-                give_back_freed_memory()
-            else:
-                self._logger.debug('not all is compiled yet: the rest is when it is first called')
-        except Exception as error:
-            # Not fatal: what is missing is compiled when it is first called.
-            self._failures.note('compiling', error)
-        self.compiling = ''
-        spent = time.monotonic() - began
-        if spent > _WORTH_TELLING and not self._closing:
-            self._logger.info(f'solver ready after {spent:.0f} s')
