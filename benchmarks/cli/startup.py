@@ -34,9 +34,8 @@ from l1slam_ros.io.compilation import fill_cache
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 
 _YARDSTICKS = ('numpy', 'scipy.sparse', 'numba')
-_ONE_LOOP = ('import numpy as np; from l1slam_ros.core.kernels.blocks import whiten; '
-             'whiten(np.ones((1, 3, 3)), np.ones((1, 3)), (0, 0, 0))')
-_BY_NUMBA = 'from l1slam_ros.core.kernels.kept import objects; objects.read = lambda step: {}; '
+_ONE_LOOP = ('import numpy as np; from l1slam_ros.core import native; '
+             'native.blocks.whiten(np.ones((1, 3, 3)), np.ones((1, 3)))')
 _COMMAND = 'import sys; from l1slam_ros.cli.main import main; sys.exit(main())'
 
 
@@ -53,7 +52,6 @@ def main() -> None:
         commands = {
             **{name: ['-c', f'import {name}'] for name in _YARDSTICKS},
             'one loop': ['-c', _ONE_LOOP],
-            'one loop by numba': ['-c', _BY_NUMBA + _ONE_LOOP],
             'l1slam --help': ['-c', _COMMAND, '--help'],
             'l1slam info': ['-c', _COMMAND, 'info', graph],
             'l1slam solve --no-robust': ['-c', _COMMAND, 'solve', graph, '--quiet', '--no-robust'],

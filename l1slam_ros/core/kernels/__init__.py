@@ -11,7 +11,7 @@ Compiled loops, each module imported when it is first asked for: numba takes a t
 
     from l1slam_ros.core import kernels
 
-    kernels.blocks.whiten(...)
+    kernels.symbolic.neighbours(...)
 """
 
 from importlib import import_module
