@@ -210,7 +210,7 @@ def _fused(problem: InnerProblem, count: int) -> None:
 
 def _fused_bytes(problem: InnerProblem) -> float:
     """
-    Return the bytes of `kernels.halpern.iterate` for each edge.
+    Return the bytes of `native.halpern.iterate` for each edge.
 
     Read: both blocks, b, y and y0 in single precision, two 32-bit keyframes; written: y. For each
     keyframe x, z and g are read and written once by the sweep over keyframes, and z read and g

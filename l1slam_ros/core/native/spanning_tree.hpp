@@ -38,8 +38,8 @@ inline Vector<int64_t> parents(Indices i, Indices j, int64_t n, Indices roots) {
         reached.assign(1, roots[r]);
         for (size_t at = 0; at < reached.size(); at++) {
             const int64_t v = reached[at];
-            std::sort(&other[begin[v]], &other[leaves[v]]);
-            std::sort(&other[leaves[v]], &other[begin[v + 1]]);
+            std::sort(other.data() + begin[v], other.data() + leaves[v]);
+            std::sort(other.data() + leaves[v], other.data() + begin[v + 1]);
             for (int64_t e = begin[v]; e < begin[v + 1]; e++)
                 if (parent[other[e]] < 0) parent[other[e]] = v, reached.push_back(other[e]);
         }
