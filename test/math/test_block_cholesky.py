@@ -20,7 +20,9 @@ from systems import (
     random_system,
 )
 
+from l1slam_ros.core import native
 from l1slam_ros.core.errors import FillError
+from l1slam_ros.core.graph.linear_system import neighbours
 from l1slam_ros.core.robust.innovation import SAMPLES
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, find_pattern
 
@@ -156,6 +158,18 @@ def test_small_pivots_are_not_taken_for_rounding(stiff):
 
 
 # The pattern
+
+
+def test_the_order_of_least_work_is_taken_where_factorisations_take_long():
+    """By levels, which suit what is alike everywhere; by minimum degree for one in the plane."""
+    n = 3600
+    keyframe = np.array([(k, k + step) for step in (1, 60) for k in range(n - step)])
+    graph = neighbours(keyframe, n)
+    works = [native.ordering.minimum_degree(*graph, stage)[1] for stage in (
+        native.ordering.levels(*graph), native.dissection.dissect(*graph), np.zeros(n, np.int32))]
+    assert works == sorted(works)
+    assert find_pattern(keyframe, n, 10 * PLENTY, 6).work == works[0]
+    assert find_pattern(keyframe, n, 10 * PLENTY, 2, uses=1).work == works[-1]
 
 
 def test_too_much_fill_is_refused():

@@ -284,7 +284,7 @@ class Dissection {
     static constexpr double CUT = 0.3;
     // The cuts of a part are made of a graph that is so many times smaller; so many cuts of each
     // smallest graph.
-    static constexpr int32_t SMALLER = 5, TRIES = 2;
+    static constexpr int32_t SMALLER = 5, TRIES = 5;
     // Of a part of more than so many nodes so many cuts are made, by merging on in different ways.
     // One cut alone costs a third more work; most of the work is in the separators of large parts,
     // most of the time to find them goes to small ones.
