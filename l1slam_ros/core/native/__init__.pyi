@@ -1,8 +1,8 @@
 """The compiled core; each module lists its functions with shapes and units."""
 
 from . import blocks as blocks
-from . import border as border
 from . import cholesky as cholesky
+from . import front as front
 from . import interior_point as interior_point
 from . import noise as noise
 from . import ordering as ordering

@@ -2,8 +2,8 @@
 // The module as Python sees it: one submodule for each header. NAME is that of the module.
 #include "arrays.hpp"
 #include "blocks.hpp"
-#include "border.hpp"
 #include "cholesky.hpp"
+#include "front.hpp"
 #include "interior_point.hpp"
 #include "noise.hpp"
 #include "ordering.hpp"
@@ -23,8 +23,8 @@ struct Part {
 };
 const Part parts[] = {
     {"blocks", blocks::methods},
-    {"border", border::methods, border::add_types},
     {"cholesky", cholesky::methods},
+    {"front", front::methods, front::add_types},
     {"interior_point", interior_point::methods},
     {"noise", noise::methods},
     {"ordering", ordering::methods},
