@@ -97,7 +97,7 @@ def front_of(shape, manifold, fixed, rng, longest=OLD):
                             fixed))
     for whole in wholes:
         whole.first.flags.writeable = False
-    front = native.border.front(*(whole.first for whole in wholes), fixed, USUAL, MU, OF_ODOMETRY,
+    front = native.front.begin(*(whole.first for whole in wholes), fixed, USUAL, MU, OF_ODOMETRY,
                                 OF_LOOPS, longest, *choleskys[L1].factor, *choleskys[L2].factor)
     return front, choleskys, wholes
 
@@ -148,7 +148,7 @@ def compare(front, choleskys, wholes, some):
         steps = np.zeros((old + len(parent), whole.k))
         steps[pulled] = pull
         steps[:old] = cholesky.solve(steps[:old].ravel()).reshape(old, -1)
-        native.border.hang(parent, turn, shift, steps)
+        native.front.hang(parent, turn, shift, steps)
         assert_allclose(steps, whole.steps()[fixed:-1], rtol=1e-6, atol=1e-8)
         assert_allclose(began, whole.first[fixed + old:], atol=1e-8)
 
@@ -215,9 +215,9 @@ def test_what_does_not_fit_is_refused_by_name(rng):
         (lambda: front.poses(2, np.array([0])), 'map 0 or 1'),
         (lambda: front.poses(L1, np.array([99])), 'keyframes there are'),
         (lambda: front.covariance(0, 99, root), 'keyframes there are'),
-        (lambda: native.border.Front.predict(None, 0, 1, z, root), 'Front'),
-        (lambda: native.border.Front(), 'cannot create'),
-        (lambda: native.border.front(wholes[L1].first[1:], wholes[L2].first, 1, USUAL, MU, 1.0,
+        (lambda: native.front.Front.predict(None, 0, 1, z, root), 'Front'),
+        (lambda: native.front.Front(), 'cannot create'),
+        (lambda: native.front.begin(wholes[L1].first[1:], wholes[L2].first, 1, USUAL, MU, 1.0,
                                      1.0, OLD, *2 * choleskys[L1].factor), 'of one shape'),
     ):
         with pytest.raises(TypeError, match=said):

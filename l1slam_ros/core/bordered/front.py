@@ -40,7 +40,7 @@ from l1slam_ros.core.robust.odometry.drift import corrected
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.optimality import smoothing
 
-# The two maps, as `native.border` numbers them.
+# The two maps, as `native.front` numbers them.
 L1, L2 = 0, 1
 # In the place of a keyframe: what the map is held by.
 _HELD = -1
@@ -109,7 +109,7 @@ class View:
             steps[self.pulled] = self.pull
             steps[:free] = self.cholesky.solve(steps[:free].ravel()).reshape(free, -1)
         # 2. Of the new ones: each follows what it hangs on.
-        native.border.hang(self.parent, self.turn, self.shift, steps)
+        native.front.hang(self.parent, self.turn, self.shift, steps)
         # 3. Steps move the poses at which all was linearised.
         first = np.concatenate((self.first, self.began))
         moved = self.manifold.retract(first[self.fixed:], steps)
@@ -171,7 +171,7 @@ class Front:
         self._choleskys = choleskys
         self._first = [np.ascontiguousarray(of_one) for of_one in poses]
         of_odometry, of_loops = variance.tolist()
-        self._border = native.border.front(
+        self._border = native.front.begin(
             self._first[L1], self._first[L2], self._fixed, usual, mu, of_odometry, of_loops,
             _LONGEST, *choleskys[L1].factor, *choleskys[L2].factor)
 

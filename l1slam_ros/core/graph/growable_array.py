@@ -118,7 +118,7 @@ def few_rows(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """
     Return a few rows of an array, (k, *shape), as `array[rows]` does.
 
-    That would let go of the interpreter's lock each time, and have to wait for it.
+    That lets go of the interpreter's lock, which a thread that computes may keep for 5 ms then.
     """
     some = np.empty((len(rows), *array.shape[1:]), array.dtype)
     for place, row in enumerate(rows.tolist()):

@@ -1,10 +1,10 @@
 """The compiled core; each module lists its functions with shapes and units."""
 
 from . import blocks as blocks
-from . import border as border
 from . import branch_and_bound as branch_and_bound
 from . import cholesky as cholesky
 from . import dissection as dissection
+from . import front as front
 from . import halpern as halpern
 from . import interior_point as interior_point
 from . import likelihood_field as likelihood_field

@@ -2,10 +2,10 @@
 // The module as Python sees it: one submodule for each header. NAME is that of the module.
 #include "arrays.hpp"
 #include "blocks.hpp"
-#include "border.hpp"
 #include "branch_and_bound.hpp"
 #include "cholesky.hpp"
 #include "dissection.hpp"
+#include "front.hpp"
 #include "halpern.hpp"
 #include "interior_point.hpp"
 #include "likelihood_field.hpp"
@@ -32,10 +32,10 @@ struct Part {
 };
 const Part parts[] = {
     {"blocks", blocks::methods},
-    {"border", border::methods, border::add_types},
     {"branch_and_bound", branch_and_bound::methods},
     {"cholesky", cholesky::methods},
     {"dissection", dissection::methods},
+    {"front", front::methods, front::add_types},
     {"halpern", halpern::methods},
     {"interior_point", interior_point::methods},
     {"likelihood_field", likelihood_field::methods},

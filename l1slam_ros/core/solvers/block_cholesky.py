@@ -242,7 +242,7 @@ class BlockCholesky:
 
     @property
     def factor(self) -> tuple[Array | Indices | Places, ...]:
-        """The factor of the last factorisation, as `native.border.front` takes it."""
+        """The factor of the last factorisation, as `native.front.begin` takes it."""
         return self._last.panels, *self._last.shape, self.pattern.position, self.pattern.owner
 
 

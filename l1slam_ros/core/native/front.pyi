@@ -1,8 +1,8 @@
-"""The bordered front: see `l1slam_ros.core.bordered.front` and `border.hpp`."""
+"""The bordered front: see `l1slam_ros.core.bordered.front` and `front.hpp`."""
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 
-def front(
+def begin(
     l1: Array, l2: Array, fixed: int, usual: float, mu: float, of_odometry: float,
     of_loops: float, longest: int, *factors: object
 ) -> Front:
