@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Search for a scan in a likelihood grid over shifts and turns; see `l1slam_ros.core.scans.search`.
+// Search for a scan in a likelihood grid by shifts and turns; see `l1slam_ros.core.scans.search`.
 // Source: Hess, Kohler, Rapp, Andor, "Real-time loop closure in 2D LIDAR SLAM", 2016, Algorithm 3.
 //
 // The scan's points are cells of the grid for each turn, at the lowest shift; a shift is so many
@@ -64,13 +64,15 @@ struct Search {
                 const Cell cell = cells[t * count + k];
                 // Quotients rounded down, as shifts of what is negative are.
                 const int64_t first = cell.u >> 3, left = (cell.v >> 3) + ACROSS;
-                const uint8_t* plane =
-                    blocks.data + (((cell.u & 7) * WIDTH + (cell.v & 7)) * columns + first) * rows +
-                    std::clamp<int64_t>(left, 0, rows - ACROSS);
                 const int64_t end = std::min(across, columns - first);
-                for (int64_t a = std::max<int64_t>(-first, 0); a < end; a++)
+                int64_t a = std::max<int64_t>(-first, 0);
+                if (a >= end) continue;
+                const int64_t plane = (cell.u & 7) * WIDTH + (cell.v & 7);
+                const uint8_t* line = blocks.data + (plane * columns + first + a) * rows +
+                                      std::clamp<int64_t>(left, 0, rows - ACROSS);
+                for (; a < end; a++, line += rows)
                     for (int64_t b = 0; b < W; b++)
-                        sums[a * W + b] = uint16_t(sums[a * W + b] + plane[a * rows + b]);
+                        sums[a * W + b] = uint16_t(sums[a * W + b] + line[b]);
             }
         }
     }
@@ -102,7 +104,7 @@ struct Search {
         return nodes;
     }
 
-    // Put the quarters of a node on the stack from `stack` on, the best one on top; return its end.
+    // Put the quarters of a node on the stack from `stack` on, the best on top; return its end.
     Node* branch(Node node, int64_t most, int64_t best, Node* stack) const {
         const int level = node.level - 1, half = 1 << level;
         const auto rows = size_t(levels.shape[2]);
@@ -111,11 +113,12 @@ struct Search {
         const Cell* own = cells.get() + node.turn * count;
         int32_t sums[4] = {0, 0, 0, 0};
         for (int64_t k = 0; k < count; k++) {
-            // Beyond the edge there is nothing, as on it; what is negative is far beyond, unsigned.
+            // Beyond the edge there is nothing, as on it; unsigned, what is negative is beyond.
             const auto u = uint32_t(own[k].u + node.column), v = uint32_t(own[k].v + node.row);
             const uint8_t* near = grid + std::min(u, last_column) * rows;
             const uint8_t* far = grid + std::min(u + uint32_t(half), last_column) * rows;
-            const uint32_t low = std::min(v, last_row), high = std::min(v + uint32_t(half), last_row);
+            const uint32_t low = std::min(v, last_row);
+            const uint32_t high = std::min(v + uint32_t(half), last_row);
             sums[0] += near[low], sums[1] += near[high];
             sums[2] += far[low], sums[3] += far[high];
         }
@@ -171,7 +174,8 @@ inline std::tuple<int64_t, int64_t, int64_t, int64_t, int64_t> search(
     require(start.size() == 2, "start must have two entries");
     require(same.size() == 3, "same must have three entries");
     require(most >= 0 && most / WIDTH < ACROSS, "most must be from 0 to 255");
-    require(least >= 0 && rival >= 0, "least and rival must not be negative");
+    require(least >= 0 && least < 1e9 && rival >= 0 && rival < 1e9,
+            "least and rival must be from 0 to 10^9");
     Search of{levels, blocks, rotations.size(), points.size(), most / WIDTH + 1, {}, {}};
     of.place(points, rotations, start);
     std::vector<Node> nodes;

@@ -11,7 +11,7 @@ namespace ray_casting {
 
 constexpr double PI = 3.14159265358979323846;
 // Further than this from the grid no ray begins or ends, in cells.
-constexpr double FARTHEST = 1e9;
+constexpr double FARTHEST = 1e7;
 
 // Add rays to a grid of log odds: each cell is told once by each ray. `free` is taken from the
 // cells that a ray passes, `occupied` added to the one it ends in where it `hits`; `most` bounds

@@ -129,7 +129,7 @@ inline void eigen(Three& A, Three& V) {
 }
 
 // Take out of H and g what is said of a direction by the errors of normals alone, which are off
-// by `off_normal` [rad]. Directions are compared in `units`; returns the least eigenvalue in these.
+// by `off_normal` [rad]. Directions are compared in `units`; returns H's least eigenvalue in them.
 inline double hold(Three& H, double (&g)[3], Vector<const double> units, double off_normal) {
     Three A, V;
     double part[3], along[3];

@@ -26,10 +26,10 @@ def match(points: Array, normals: Array, map_points: Array, map_normals: Array,
     """
     Return pose (3,), H (3, 3), its least eigenvalue in `units` and the sums of the last round.
 
-    start : (3,); prior, information : (3,) and (3, 3) in its axes; units : (3,) in which directions are
-    compared; gate : of the first round [m]; variance : of a residual [m^2]; off_normal : [rad]
-    normals are off by so much, and what they say by that alone is taken out of H. The others as
-    above.
+    start : (3,); prior, information : (3,) and (3, 3) in its axes; units : (3,) in which
+    directions are compared; gate : of the first round [m]; variance : of a residual [m^2];
+    off_normal : [rad] normals are off by so much, and what they say by that alone is taken out of
+    H. The others as above.
     """
 
 def information(H: Array, scatter: Array, variance: float) -> Array:

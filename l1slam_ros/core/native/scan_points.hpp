@@ -168,8 +168,8 @@ inline Point normal_of(const Points& away, size_t k, double least_reach, double 
 }
 
 // Points at equal distances along what a scan has seen, their normals, and the view in so many
-// equal bearings. `ends` is where each ray ends; it looks where its range is above `range_min`, and
-// hits below `range_max`.
+// equal bearings. `ends` is where each ray ends; it looks where its range is above `range_min`,
+// and hits below `range_max`.
 inline std::tuple<Matrix<double>, Matrix<double>, Vector<double>> points_of(
     Matrix<const double> ends, Vector<const double> ranges, Vector<const double> angles,
     Vector<const int64_t> bearings, int64_t bins, double range_min, double range_max,

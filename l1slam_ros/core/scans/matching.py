@@ -39,7 +39,7 @@ KAPPA = 1.5
 _VARIANCE = KAPPA * SIGMA**2
 # [rad] Normals are off by so much: what they say of the way along a wall is noise.
 _OFF_NORMAL = 0.05
-# [m] Points farther than this do not match in the first round; each is narrower than the last.
+# [m] Points farther than this do not match in the first round; the gate of later ones is narrower.
 _WIDEST = REACH
 # Of no prior.
 _NOTHING = np.zeros((3, 3))
