@@ -169,7 +169,7 @@ def from_rotation(R: Array, t: Array) -> Array:
 def from_pose3(pose3: Array) -> Array:
     """Project x y z qx qy qz qw (n, 7) onto the plane: x, y and the yaw, (n, 3)."""
     if pose3.ndim == 2 and len(pose3) <= _FEW:
-        return native.poses.onto_plane(pose3)
+        return native.poses.onto_plane(np.asarray(pose3, np.float64))
     qx, qy, qz, qw = (pose3[..., k] for k in range(3, 7))
     yaw = np.arctan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
     return np.concatenate((pose3[..., :2], yaw[..., None]), axis=-1)

@@ -130,7 +130,8 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     innovation[cut, :, 0] = -without.system.b.reshape(-1, k)
     root = unwhitening(measured, rows)
     spread = root @ inverse @ root.transpose(0, 2, 1)
-    square, log_det = native.prediction.normalise(inverse.copy(), innovation[:, :, 0])
+    square, log_det = native.prediction.normalise(
+        inverse.astype(np.float64), innovation[:, :, 0])
     # With the estimated noise, or with the stated one.
     found = max((r[~cut] ** 2).sum() / np.trace(R[~cut], axis1=1, axis2=2).sum(), 1.0)
     said = growth.noise.said[0]
