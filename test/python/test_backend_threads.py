@@ -118,7 +118,8 @@ def test_answers_come_while_an_improvement_is_computed(options):
         assert backend.update(DEADLINE) is not None
         assert len(backend.poses) == backend.counts().sizes['keyframes'] == 33
         assert backend.robot().stamp == 32 * 10**9
-        assert len(states(backend)) == 1 and backend.behind().loops == 1
+        # The judge, which nothing holds, may have looked at it already.
+        assert len(states(backend)) == 1 and backend.behind().loops <= 1
         saved = backend.saved()
         held.goes_on.set()
         wait_until(lambda: backend.behind().at_rest)
