@@ -46,6 +46,9 @@ OF_ROS = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'na
 COLCON = ('colcon-bash', 'colcon-output', 'colcon-ros', 'numpy', 'setuptools<80',
           '--no-binary=empy')
 
+# The core as it compiles soonest; how fast it is then, no test of the package asks.
+QUICKLY = {'CXXFLAGS': '-O0'}
+
 # What `l1slam` makes of one small world, run in a folder of its own.
 SMOKE = """
 import contextlib, importlib.util, io, json, sys
@@ -104,7 +107,7 @@ def wheel(sdist, tmp_path_factory):
     # From this version on setuptools builds wheels by itself: nothing has to be fetched.
     able = Version(importlib.metadata.version('setuptools')) >= Version('70.1')
     run(sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps', '--wheel-dir', folder,
-        *['--no-build-isolation'] * able, sdist, cwd=folder, env=own_variables())
+        *['--no-build-isolation'] * able, sdist, cwd=folder, env=own_variables(**QUICKLY))
     (file,) = folder.glob('*.whl')
     with zipfile.ZipFile(file) as archive:
         yield archive
@@ -250,7 +253,7 @@ def workspace(request, source, tmp_path_factory):
     shutil.copytree(source, folder / 'src' / 'l1slam_ros', symlinks=True)
     # Setuptools warns where Python is told to write no bytecode.
     built = environment(*COLCON).run('colcon', 'build', *request.param, cwd=folder,
-                                     HOME=str(folder), PYTHONDONTWRITEBYTECODE='')
+                                     HOME=str(folder), PYTHONDONTWRITEBYTECODE='', **QUICKLY)
     # Were anything said on standard error, colcon would show it to its user and say so below.
     assert re.search('Summary: 1 package finished.*\n$', built), built
     return folder

@@ -53,8 +53,8 @@ def sanitized(libraries, tmp_path_factory):
     return folder
 
 
-def sanitizing(libraries, level, **more):
-    return {**os.environ, 'L1SLAM_ROS_SIMD': level, 'LD_PRELOAD': ' '.join(libraries),
+def sanitizing(libraries, **more):
+    return {**os.environ, 'LD_PRELOAD': ' '.join(libraries),
             # Each object is an allocation of its own, and Python frees little at its end.
             'PYTHONMALLOC': 'malloc', 'ASAN_OPTIONS': 'detect_leaks=0', **more}
 
@@ -72,13 +72,13 @@ def test_what_is_wrong_is_noticed(libraries, kind, tmp_path):
     assert done.returncode and 'overflow' in done.stderr
 
 
-@pytest.mark.parametrize('level', ['avx2', 'portable'])
-def test_the_tests_of_the_core_touch_nothing_else(sanitized, libraries, level):
+def test_the_tests_of_the_core_touch_nothing_else(sanitized, libraries):
+    """The tests of each kernel go through both levels; all else runs on the best one."""
     math = ROOT / 'test' / 'math'
     tests = [path for path in sorted(math.glob('test_*.py'))
              if OF_THE_CORE.search(path.read_text())]
     done = subprocess.run(
         [sys.executable, '-m', 'pytest', '-q', '-x', '-p', 'no:cacheprovider', '-p', 'no:xdist',
          *map(str, tests)], cwd=sanitized, capture_output=True, text=True, timeout=3 * DEADLINE,
-        env=sanitizing(libraries, level, PYTHONPATH=str(sanitized)), check=False)
+        env=sanitizing(libraries, PYTHONPATH=str(sanitized)), check=False)
     assert done.returncode == 0, done.stdout + done.stderr

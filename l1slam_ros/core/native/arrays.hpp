@@ -296,6 +296,9 @@ struct Function<F, BRIEF, FEW> {
         } catch (const std::length_error&) {  // a vector of more than there can be
             if (state) PyEval_RestoreThread(state);
             return PyErr_NoMemory();
+        } catch (const std::exception& problem) {  // such as a thread that cannot be started
+            if (state) PyEval_RestoreThread(state);
+            return PyErr_Format(PyExc_RuntimeError, "%s: %s", name().c_str(), problem.what());
         }
     }
 };
