@@ -36,6 +36,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+# Of no more rows than that, as they come one by one, a call of NumPy costs more than its sums.
+FEW = 8
+
+
+def are_few(a: Array, b: Array | None = None) -> bool:
+    """Return whether each is a matrix of a few rows, for which a native call is quicker."""
+    b = a if b is None else b
+    return a.ndim == b.ndim == 2 and len(a) <= FEW >= len(b)
 
 
 class Manifold(Protocol):

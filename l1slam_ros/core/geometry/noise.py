@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from l1slam_ros.core import native
 from l1slam_ros.core.errors import NoiseError
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.manifold import FEW, Array, Indices, Manifold
 
 Mask = NDArray[np.bool_]
 
@@ -49,8 +49,6 @@ LEAST_VARIANCE, MOST_VARIANCE = 1e-8, 1e6
 # Odometry is taken to know that much. Where sixty steps of Intel's have 100, the chain is torn and
 # the judgement finds no loop likely any more; at 10 it takes all.
 MOST_OF_ODOMETRY = 10.0
-# Of no more measurements than that, as they come one by one, a call costs more than its sums.
-_FEW = 8
 
 
 def square_root_information(information: Array) -> Array:
@@ -142,7 +140,7 @@ def silent_components(covariance: Array, absolute: bool) -> Mask:
 
 def usable(covariance: Array) -> Mask:
     """Tell which of (m, d, d) matrices are covariances, (m,): messages carry zeros and worse."""
-    if len(covariance) <= _FEW:
+    if len(covariance) <= FEW:
         return native.noise.usable(np.ascontiguousarray(covariance), _ASYMMETRY, _SINGULAR)
     none = np.zeros(covariance.shape[:2], bool)
     flawed = np.any([bad for bad, _ in _flaws(covariance, none)], axis=0)
@@ -212,7 +210,7 @@ def sigmas(manifold: Manifold, translation: float, rotation: float) -> Array:
 
 def root_of_inverse(covariance: Array) -> Array:
     """Return the root L', see `square_root_information`, for sound covariances (m, d, d)."""
-    if len(covariance) <= _FEW:
+    if len(covariance) <= FEW:
         return native.noise.root_of_inverse(np.ascontiguousarray(covariance))
     silent = _without_variance(covariance)
     # Cholesky from the last row up gives U U' with U upper triangular, and L' = U^-1.

@@ -16,7 +16,7 @@ al., "A Tutorial on Graph-Based SLAM" (2010), sections IV and V, with the step o
 import numpy as np
 
 from l1slam_ros.core import native
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, are_few
 
 NAME = 'SE2'
 POSE_SIZE = 3
@@ -25,8 +25,6 @@ TRANSLATION = slice(0, 2)
 ROTATION = slice(2, 3)
 # Where x, y and yaw stand in the 6x6 covariance of a ROS message (x y z rx ry rz).
 COVARIANCE_ROWS: tuple[int, ...] = (0, 1, 5)
-# Of no more poses than that, as they come one by one, a call costs more than its sums.
-_FEW = 8
 
 
 def wrap(angle: Array) -> Array:
@@ -57,7 +55,7 @@ def identity(n: int) -> Array:
 
 def compose(a: Array, b: Array) -> Array:
     """Return a b, (n, 3)."""
-    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+    if are_few(a, b):
         return native.poses.compose(a, b)
     x, y = _turned(a[..., 2], b[..., 0], b[..., 1])
     return _pose(a[..., 0] + x, a[..., 1] + y, a[..., 2] + b[..., 2])
@@ -65,14 +63,14 @@ def compose(a: Array, b: Array) -> Array:
 
 def inverse(a: Array) -> Array:
     """Return a^-1, (n, 3)."""
-    if a.ndim == 2 and len(a) <= _FEW:
+    if are_few(a):
         return native.poses.inverse(a)
     return _pose(*_turned(-a[..., 2], -a[..., 0], -a[..., 1]), -a[..., 2])
 
 
 def between(a: Array, b: Array) -> Array:
     """Return a^-1 b, (n, 3)."""
-    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+    if are_few(a, b):
         return native.poses.between(a, b)
     moved = _turned(-a[..., 2], b[..., 0] - a[..., 0], b[..., 1] - a[..., 1])
     return _pose(*moved, b[..., 2] - a[..., 2])
@@ -80,6 +78,8 @@ def between(a: Array, b: Array) -> Array:
 
 def retract(pose: Array, step: Array) -> Array:
     """Return pose v2t(step); a pose of SE(2) and its tangent share their coordinates."""
+    if are_few(pose, step):
+        return native.poses.retract(pose, step)
     rows = (np.ascontiguousarray(each).reshape(-1, 3) for each in (pose, step))
     return native.se2.retract(*rows).reshape(pose.shape)
 
@@ -146,7 +146,7 @@ def interpolate(a: Array, b: Array, fraction: Array) -> Array:
 
 def motion(step: Array) -> tuple[Array, Array]:
     """Return the length [m] and the angle [rad] of each relative pose, (n,) and (n,)."""
-    if step.ndim == 2 and len(step) <= _FEW:
+    if are_few(step):
         return native.poses.motion(step)
     return np.hypot(step[..., 0], step[..., 1]), np.abs(step[..., 2])
 
@@ -168,7 +168,7 @@ def from_rotation(R: Array, t: Array) -> Array:
 
 def from_pose3(pose3: Array) -> Array:
     """Project x y z qx qy qz qw (n, 7) onto the plane: x, y and the yaw, (n, 3)."""
-    if pose3.ndim == 2 and len(pose3) <= _FEW:
+    if are_few(pose3):
         return native.poses.onto_plane(np.asarray(pose3, np.float64))
     qx, qy, qz, qw = (pose3[..., k] for k in range(3, 7))
     yaw = np.arctan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)

@@ -18,7 +18,7 @@ kinematics for the error-state Kalman filter" (2017).
 import numpy as np
 
 from l1slam_ros.core import native
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, are_few
 
 NAME = 'SE3'
 POSE_SIZE = 7
@@ -32,8 +32,6 @@ COVARIANCE_ROWS: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
 _UNIT = 4 * np.finfo(float).eps
 # [rad] Below, terms of the fourth order of an angle are lost in rounding.
 _SMALL = 1e-4
-# Of no more poses than that, as they come one by one, a call costs more than its sums.
-_FEW = 8
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -103,14 +101,14 @@ def identity(n: int) -> Array:
 
 def compose(a: Array, b: Array) -> Array:
     """Return a b, (n, 7)."""
-    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+    if are_few(a, b):
         return native.poses.compose(a, b)
     return _pose(a[..., :3] + _turned(a[..., 3:], b[..., :3]), _times(a[..., 3:], b[..., 3:]))
 
 
 def inverse(a: Array) -> Array:
     """Return a^-1, (n, 7)."""
-    if a.ndim == 2 and len(a) <= _FEW:
+    if are_few(a):
         return native.poses.inverse(a)
     q = _opposite(a[..., 3:])
     return _pose(-_turned(q, a[..., :3]), q)
@@ -118,7 +116,7 @@ def inverse(a: Array) -> Array:
 
 def between(a: Array, b: Array) -> Array:
     """Return a^-1 b, (n, 7)."""
-    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+    if are_few(a, b):
         return native.poses.between(a, b)
     q = _opposite(a[..., 3:])
     return _pose(_turned(q, b[..., :3] - a[..., :3]), _times(q, b[..., 3:]))
@@ -126,7 +124,7 @@ def between(a: Array, b: Array) -> Array:
 
 def retract(pose: Array, step: Array) -> Array:
     """Return pose (rho, exp omega), (n, 7)."""
-    if pose.ndim == step.ndim == 2 and len(pose) <= _FEW >= len(step):
+    if are_few(pose, step):
         return native.poses.retract(pose, step)
     rows = np.ascontiguousarray(pose).reshape(-1, 7), np.ascontiguousarray(step).reshape(-1, 6)
     return native.se3.retract(*rows).reshape(pose.shape)
@@ -134,7 +132,7 @@ def retract(pose: Array, step: Array) -> Array:
 
 def local(a: Array, b: Array) -> Array:
     """Return the step that retracts a to b, (n, 6)."""
-    if a.ndim == b.ndim == 2 and len(a) <= _FEW >= len(b):
+    if are_few(a, b):
         return native.poses.local(a, b)
     relative = between(a, b)
     return np.concatenate((relative[..., :3], _log(relative[..., 3:])), axis=-1)
@@ -202,7 +200,7 @@ def interpolate(a: Array, b: Array, fraction: Array) -> Array:
 
 def motion(step: Array) -> tuple[Array, Array]:
     """Return the length [m] and the angle [rad] of each relative pose, (n,) and (n,)."""
-    if step.ndim == 2 and len(step) <= _FEW:
+    if are_few(step):
         return native.poses.motion(step)
     return np.linalg.norm(step[..., :3], axis=-1), np.linalg.norm(step[..., 3:], axis=-1)
 

@@ -16,7 +16,6 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <cstdio>
 #include <cstring>
 #include <memory>
 #include <new>
@@ -176,7 +175,6 @@ template <class... Ts> struct Convert<std::tuple<Ts...>> {
     }
 };
 
-
 // An object of C++ that Python holds: a type of its own, made by `add_type`, without a constructor.
 // Functions take it as a pointer, their first argument; they are its methods.
 template <class T> struct Held {
@@ -241,6 +239,16 @@ template <class T, int N> int64_t entries(const Array<T, N>& array) {
     return count;
 }
 
+// While it lives the interpreter's lock is let go, unless `held`.
+struct Unlocked {
+    PyThreadState* state;
+    explicit Unlocked(bool held) : state(held ? nullptr : PyEval_SaveThread()) {}
+    Unlocked(const Unlocked&) = delete;
+    ~Unlocked() {
+        if (state) PyEval_RestoreThread(state);
+    }
+};
+
 // What Python calls for F. The interpreter's lock is let go unless the function is BRIEF, or its
 // arrays hold FEW numbers or less: whoever lets go of it may have to wait until another thread lets
 // go of it in turn.
@@ -275,29 +283,26 @@ struct Function<F, BRIEF, FEW> {
         std::tuple<Ts...> values{};
         if (!(convert<I>(given, std::get<I>(values)) && ...)) return nullptr;
         const bool is_brief = BRIEF || (entries(std::get<I>(values)) + ... + 0) <= FEW;
-        PyThreadState* state = is_brief ? nullptr : PyEval_SaveThread();
+        auto called = [&] {
+            const Unlocked unlocked(is_brief);
+            return F(std::get<I>(values)...);
+        };
         try {
             if constexpr (std::is_void_v<R>) {
-                F(std::get<I>(values)...);
-                if (state) PyEval_RestoreThread(state);
+                called();
                 Py_INCREF(Py_None);
                 return Py_None;
             } else {
-                R result = F(std::get<I>(values)...);
-                if (state) PyEval_RestoreThread(state);
+                R result = called();
                 return Convert<R>::to(result);
             }
         } catch (const Mismatch& problem) {
-            if (state) PyEval_RestoreThread(state);
             return PyErr_Format(PyExc_TypeError, "%s: %s", name().c_str(), problem.what());
         } catch (const std::bad_alloc&) {
-            if (state) PyEval_RestoreThread(state);
             return PyErr_NoMemory();
         } catch (const std::length_error&) {  // a vector of more than there can be
-            if (state) PyEval_RestoreThread(state);
             return PyErr_NoMemory();
         } catch (const std::exception& problem) {  // such as a thread that cannot be started
-            if (state) PyEval_RestoreThread(state);
             return PyErr_Format(PyExc_RuntimeError, "%s: %s", name().c_str(), problem.what());
         }
     }

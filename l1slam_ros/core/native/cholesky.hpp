@@ -22,7 +22,7 @@ namespace cholesky {
 // A pivot that is left with less than this part of its diagonal entry is rounding.
 constexpr double SINGULAR = 1e-13;
 // Rows and columns of a tile: as many sums as registers hold.
-constexpr int ROWS = WIDTH == 8 ? 12 : WIDTH == 4 ? 6 : 3, WIDE = WIDTH == 2 ? 4 : 8;
+constexpr int ROWS = WIDTH == 4 ? 6 : 3, WIDE = WIDTH == 2 ? 4 : 8;
 constexpr int NARROW = WIDTH == 2 ? 2 : 4;
 // Rows of a block in the plane, and most columns of a source that is subtracted block by block.
 constexpr int PLANE = 3, THIN = 12;

@@ -220,9 +220,13 @@ template <class G> class FrontOf : public Front {
                              Square<K> (&blocks)[2]) {
         Square<K> R;
         std::copy_n(root.data, K * K, R.begin());
-        Square<K> J[2];
-        G::jacobians(z.data, first[0].data(), first[1].data(), J);
-        for (int side : {0, 1}) blocks[side] = product<K>(R, J[side]);
+        double both[2 * K * K];
+        G::jacobians(z.data, first[0].data(), first[1].data(), both);
+        for (int side : {0, 1}) {
+            Square<K> J;
+            std::copy_n(both + side * K * K, K * K, J.begin());
+            blocks[side] = product<K>(R, J);
+        }
         return product<K>(R, G::residual(z.data, now[0].data(), now[1].data()));
     }
 

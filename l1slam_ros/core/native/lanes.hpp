@@ -6,9 +6,8 @@
 #include <immintrin.h>
 #endif
 
-#if defined(__AVX512F__)
-constexpr int WIDTH = 8;
-#elif defined(__AVX__)
+// There is no level for AVX-512: it would spare 6% of a solve in space, and be compiled everywhere.
+#if defined(__AVX__)
 constexpr int WIDTH = 4;
 #else
 constexpr int WIDTH = 2;
@@ -27,7 +26,7 @@ template <int W> struct RegisterOf;
         typedef double Type __attribute__((vector_size(8 * W))); \
         typedef double Unaligned __attribute__((vector_size(8 * W), aligned(8), may_alias)); \
     };
-REGISTER(2) REGISTER(4) REGISTER(8)
+REGISTER(2) REGISTER(4)
 
 template <int N> struct Lanes {
     static constexpr int W = N < WIDTH ? N : WIDTH, PARTS = N / W;
@@ -56,13 +55,6 @@ template <int N> struct Lanes {
         UNROLL for (int p = 0; p < PARTS; p++) {
             Register r{};
             int left = count - p * W;
-#if defined(__AVX512F__)
-            if constexpr (W == 8) {
-                r = (Register)_mm512_maskz_loadu_pd((1 << (left < 8 ? left : 8)) - 1, from + p * W);
-                all.part[p] = r;
-                continue;
-            }
-#endif
 #if defined(__AVX__)
             if constexpr (W == 4) {
                 const double* at = from + p * W;
@@ -82,13 +74,6 @@ template <int N> struct Lanes {
         if (count == N) return store(to);
         UNROLL for (int p = 0; p < PARTS; p++) {
             int left = count - p * W;
-#if defined(__AVX512F__)
-            if constexpr (W == 8) {
-                _mm512_mask_storeu_pd(to + p * W, (1 << (left < 8 ? left : 8)) - 1,
-                                      (__m512d)part[p]);
-                continue;
-            }
-#endif
 #if defined(__AVX__)
             // By parts: a masked store takes many times as long on some processors.
             if constexpr (W == 4) {

@@ -4,7 +4,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <limits>
 
 #include "arrays.hpp"
 #include "se2.hpp"
@@ -16,41 +15,32 @@ namespace poses {
 template <int K> using Square = std::array<double, K * K>;
 template <int K> using Few = std::array<double, K>;
 
-// Poses x, y, theta of the plane.
+// Poses x, y, theta of the plane; J : (2, K, K), as `se2` has it.
 struct Plane {
     static constexpr int P = 3, K = 3;
     static void identity(double* pose) { pose[0] = pose[1] = pose[2] = 0.0; }
-    static void compose(const double* a, const double* b, double* ab) {
-        double c = std::cos(a[2]), s = std::sin(a[2]);
-        double x = a[0] + (c * b[0] - s * b[1]), y = a[1] + (s * b[0] + c * b[1]);
-        ab[2] = se2::wrapped(a[2] + b[2]);
-        ab[0] = x, ab[1] = y;
-    }
+    static void compose(const double* a, const double* b, double* ab) { se2::compose(a, b, ab); }
     static void retract(const double* pose, const Few<K>& step, double* to) {
-        compose(pose, step.data(), to);
+        se2::compose(pose, step.data(), to);
     }
     static void inverse(const double* a, double* to) {
-        double c = std::cos(a[2]), s = std::sin(a[2]);
+        const auto [c, s] = se2::turn_of(a[2]);
         to[0] = -c * a[0] - s * a[1], to[1] = s * a[0] - c * a[1];
         to[2] = se2::wrapped(-a[2]);
     }
     static void between(const double* a, const double* b, double* to) {
-        double c = std::cos(a[2]), s = std::sin(a[2]), x = b[0] - a[0], y = b[1] - a[1];
-        to[0] = c * x + s * y, to[1] = c * y - s * x;
+        const se2::Seen t(a, b, se2::turn_of(a[2]));
+        to[0] = t.x, to[1] = t.y;
         to[2] = se2::wrapped(b[2] - a[2]);
     }
     static Few<K> step_to(const double* pose) { return {pose[0], pose[1], pose[2]}; }
     static Few<K> residual(const double* z, const double* i, const double* j) {
-        double c = std::cos(z[2]), s = std::sin(z[2]);
-        se2::Seen t(i, j, std::cos(i[2]), std::sin(i[2]));
-        return {c * (t.x - z[0]) + s * (t.y - z[1]), c * (t.y - z[1]) - s * (t.x - z[0]),
-                se2::wrapped(j[2] - i[2] - z[2])};
+        Few<K> e;
+        se2::write_residual(z, i, j, se2::turn_of(z[2]), se2::turn_of(i[2]), e.data());
+        return e;
     }
-    static void jacobians(const double* z, const double* i, const double* j, Square<K> (&J)[2]) {
-        double c = std::cos(z[2]), s = std::sin(z[2]), phi = j[2] - i[2] - z[2];
-        se2::Seen t(i, j, std::cos(i[2]), std::sin(i[2]));
-        J[0] = {-c, -s, c * t.y - s * t.x, s, -c, -s * t.y - c * t.x, 0, 0, -1};
-        J[1] = {std::cos(phi), -std::sin(phi), 0, std::sin(phi), std::cos(phi), 0, 0, 0, 1};
+    static void jacobians(const double* z, const double* i, const double* j, double* J) {
+        se2::write_jacobians(i, j, se2::turn_of(z[2]), se2::turn_of(i[2]), se2::turn_of(j[2]), J);
     }
 };
 
@@ -58,38 +48,19 @@ struct Plane {
 struct Space {
     static constexpr int P = 7, K = 6;
     static void identity(double* pose) { std::fill_n(pose, 6, 0.0), pose[6] = 1.0; }
-    static se3::Quaternion opposite(se3::Quaternion q) { return {-q.x, -q.y, -q.z, q.w}; }
-    static void set(double* to, se3::Point t, se3::Quaternion q) {
-        double square = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w;
-        // What was normalised once stays as it is.
-        bool is_unit = std::abs(square - 1) <= 4 * std::numeric_limits<double>::epsilon();
-        double scale = (is_unit ? 1.0 : 1 / std::sqrt(square)) * (q.w < 0 ? -1 : 1);
-        const double pose[7] = {t.x, t.y, t.z, scale * q.x, scale * q.y, scale * q.z, scale * q.w};
-        std::copy(pose, pose + 7, to);
-    }
-    static void move(const double* a, se3::Point step, se3::Quaternion turn, double* to) {
-        se3::Quaternion back = opposite(se3::turn_of(a));
-        se3::Point t = se3::turned_back(back, step);
-        set(to, {a[0] + t.x, a[1] + t.y, a[2] + t.z}, se3::product(back, turn));
-    }
-    static void compose(const double* a, const double* b, double* ab) {
-        move(a, {b[0], b[1], b[2]}, se3::turn_of(b), ab);
-    }
+    static void compose(const double* a, const double* b, double* ab) { se3::compose(a, b, ab); }
     static void retract(const double* pose, const Few<K>& step, double* to) {
-        double half = std::sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5]) / 2;
-        double share = (half > 0 ? std::sin(half) / half : 1.0) / 2;
-        move(pose, {step[0], step[1], step[2]},
-             {share * step[3], share * step[4], share * step[5], std::cos(half)}, to);
+        se3::move(pose, step.data(), to);
     }
     static void inverse(const double* a, double* to) {
         se3::Quaternion q = se3::turn_of(a);
         se3::Point t = se3::turned_back(q, {-a[0], -a[1], -a[2]});
-        set(to, t, opposite(q));
+        se3::write(t, {-q.x, -q.y, -q.z, q.w}, to);
     }
     static void between(const double* a, const double* b, double* to) {
         se3::Quaternion q = se3::turn_of(a);
-        set(to, se3::turned_back(q, {b[0] - a[0], b[1] - a[1], b[2] - a[2]}),
-            se3::product(q, se3::turn_of(b)));
+        se3::write(se3::turned_back(q, {b[0] - a[0], b[1] - a[1], b[2] - a[2]}),
+                   se3::product(q, se3::turn_of(b)), to);
     }
     static Few<K> step_to(const double* pose) {
         double sine = std::sqrt(pose[3] * pose[3] + pose[4] * pose[4] + pose[5] * pose[5]);
@@ -98,27 +69,12 @@ struct Space {
         return {pose[0], pose[1], pose[2], share * pose[3], share * pose[4], share * pose[5]};
     }
     static Few<K> residual(const double* z, const double* i, const double* j) {
-        se3::Seen at(z, i, j);
-        auto t = se3::turned_back(se3::turn_of(z), {at.p.x - z[0], at.p.y - z[1], at.p.z - z[2]});
-        return {t.x, t.y, t.z, 2 * at.q.x, 2 * at.q.y, 2 * at.q.z};
+        Few<K> e;
+        se3::write_residual(z, i, j, e.data());
+        return e;
     }
-    static void jacobians(const double* z, const double* i, const double* j, Square<K> (&J)[2]) {
-        se3::Seen at(z, i, j);
-        se3::Square R_z = se3::Square::of(se3::turn_of(z)), R_ij = se3::Square::of(at.q_ij);
-        se3::Square M = se3::Square::skew({at.q.x, at.q.y, at.q.z}, at.q.w);
-        const double p[3] = {at.p.x, at.p.y, at.p.z};
-        J[0] = J[1] = {};
-        for (int r = 0; r < 3; r++)
-            for (int c = 0; c < 3; c++) {
-                int a = (c + 1) % 3, b = (c + 2) % 3;
-                J[0][r * 6 + c] = -R_z.m[c][r];
-                J[0][r * 6 + 3 + c] = R_z.m[a][r] * p[b] - R_z.m[b][r] * p[a];
-                J[1][(3 + r) * 6 + 3 + c] = M.m[r][c];
-                for (int k = 0; k < 3; k++) {
-                    J[1][r * 6 + c] += R_z.m[k][r] * R_ij.m[k][c];
-                    J[0][(3 + r) * 6 + 3 + c] -= M.m[r][k] * R_ij.m[c][k];
-                }
-            }
+    static void jacobians(const double* z, const double* i, const double* j, double* J) {
+        se3::write_jacobians(z, i, j, J);
     }
 };
 
@@ -142,30 +98,24 @@ inline void require_poses(const Rows& a) {
     require(a.shape[1] == Plane::P || a.shape[1] == Space::P, "poses (n, 3) or (n, 7)");
 }
 
-template <class G> Matrix<double> compose_of(const Rows& a, const Rows& b) {
+// A verb of two poses that makes a third, of each row.
+template <class G, class Verb> Matrix<double> of_pairs(const Rows& a, const Rows& b, Verb verb) {
     require(b.shape[1] == G::P, "b of (n, p)");
     const int64_t count = rows_of(a, b);
     auto made = new_array<double, 2>({count, G::P});
     for (int64_t n = 0; n < count; n++)
-        G::compose(row_of<G::P>(a, n).data(), row_of<G::P>(b, n).data(), made[n]);
+        verb(row_of<G::P>(a, n).data(), row_of<G::P>(b, n).data(), made[n]);
     return made;
 }
 inline Matrix<double> compose(Rows a, Rows b) {
     require_poses(a);
-    return OF_GROUP(a.shape[1], compose_of, a, b);
-}
-
-template <class G> Matrix<double> between_of(const Rows& a, const Rows& b) {
-    require(b.shape[1] == G::P, "b of (n, p)");
-    const int64_t count = rows_of(a, b);
-    auto made = new_array<double, 2>({count, G::P});
-    for (int64_t n = 0; n < count; n++)
-        G::between(row_of<G::P>(a, n).data(), row_of<G::P>(b, n).data(), made[n]);
-    return made;
+    return a.shape[1] == Plane::P ? of_pairs<Plane>(a, b, Plane::compose)
+                                  : of_pairs<Space>(a, b, Space::compose);
 }
 inline Matrix<double> between(Rows a, Rows b) {
     require_poses(a);
-    return OF_GROUP(a.shape[1], between_of, a, b);
+    return a.shape[1] == Plane::P ? of_pairs<Plane>(a, b, Plane::between)
+                                  : of_pairs<Space>(a, b, Space::between);
 }
 
 template <class G> Matrix<double> inverse_of(const Rows& a) {

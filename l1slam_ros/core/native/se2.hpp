@@ -26,7 +26,13 @@ constexpr double COSINE[] = {4.16666666666666019037e-02, -1.38888888888741095749
                              2.48015872894767294178e-05, -2.75573143513906633035e-07,
                              2.08757232129817482790e-09, -1.13596475577881948265e-11};
 
-// Cosines and sines of the angles of poses: all at once, so that it is done by vectors. As exact
+// Cosine and sine of an angle [rad].
+struct Turn {
+    double c, s;
+};
+inline Turn turn_of(double angle) { return {std::cos(angle), std::sin(angle)}; }
+
+// Those of the angles of poses: all at once, so that it is done by vectors. As exact
 // as for an angle that differs by the rounding of this one. NaN and infinity become NaN; an angle
 // so large that its rounding is a turn becomes some other angle.
 struct Turns {
@@ -56,6 +62,7 @@ struct Turns {
             to_s[k] = quadrant >= 2 ? -across : across;
         }
     }
+    Turn operator[](int64_t k) const { return {c[k], s[k]}; }
 };
 
 // An angle [rad] in (-pi, pi].
@@ -64,21 +71,47 @@ inline double wrapped(double angle) {
     return angle <= -PI || angle > PI ? PI : angle;  // NaN stays
 }
 
-// The position of j seen from i, Ri'(tj - ti); c, s : cosine and sine of i's angle.
+// The position of j seen from i, Ri'(tj - ti).
 struct Seen {
     double x, y;
-    Seen(const double* i, const double* j, double c, double s)
-        : x(c * (j[0] - i[0]) + s * (j[1] - i[1])), y(c * (j[1] - i[1]) - s * (j[0] - i[0])) {}
+    Seen(const double* i, const double* j, Turn i_)
+        : x(i_.c * (j[0] - i[0]) + i_.s * (j[1] - i[1])),
+          y(i_.c * (j[1] - i[1]) - i_.s * (j[0] - i[0])) {}
 };
 
-// a b.
-inline void compose(const double* a, const double* b, double c, double s, double* product) {
-    product[0] = a[0] + c * b[0] - s * b[1];
-    product[1] = a[1] + s * b[0] + c * b[1];
+// One row each; of_z, of_i, of_j : the turns of z, i and j.
+
+// a b; `product` may be a.
+inline void compose(const double* a, const double* b, Turn of_a, double* product) {
+    product[0] = a[0] + of_a.c * b[0] - of_a.s * b[1];
+    product[1] = a[1] + of_a.s * b[0] + of_a.c * b[1];
     product[2] = wrapped(a[2] + b[2]);
 }
 inline void compose(const double* a, const double* b, double* product) {
-    compose(a, b, std::cos(a[2]), std::sin(a[2]), product);
+    compose(a, b, turn_of(a[2]), product);
+}
+
+inline void write_residual(const double* z, const double* i, const double* j, Turn of_z,
+                           Turn of_i, double* e) {
+    Seen t(i, j, of_i);
+    e[0] = of_z.c * (t.x - z[0]) + of_z.s * (t.y - z[1]);
+    e[1] = of_z.c * (t.y - z[1]) - of_z.s * (t.x - z[0]);
+    e[2] = wrapped(j[2] - i[2] - z[2]);
+}
+
+// J : (2, 3, 3) J_r_i and J_r_j.
+inline void write_jacobians(const double* i, const double* j, Turn of_z, Turn of_i, Turn of_j,
+                            double* J) {
+    const auto [c, s] = of_z;
+    Seen t(i, j, of_i);
+    double c_ij = of_i.c * of_j.c + of_i.s * of_j.s, s_ij = of_i.c * of_j.s - of_i.s * of_j.c;
+    double c_phi = c * c_ij + s * s_ij, s_phi = c * s_ij - s * c_ij;
+    J[0] = -c, J[1] = -s, J[2] = c * t.y - s * t.x;
+    J[3] = s, J[4] = -c, J[5] = -s * t.y - c * t.x;
+    J[6] = 0, J[7] = 0, J[8] = -1;
+    J[9] = c_phi, J[10] = -s_phi, J[11] = 0;
+    J[12] = s_phi, J[13] = c_phi, J[14] = 0;
+    J[15] = 0, J[16] = 0, J[17] = 1;
 }
 
 // Poses moved by right steps: a pose and its tangent share their coordinates.
@@ -87,8 +120,7 @@ inline Matrix<double> retract(Poses pose, Poses step) {
     require(step.size() == pose.size() && step.shape[1] == 3, "step must be (n, 3), like pose");
     auto moved = new_array<double, 2>({pose.size(), 3});
     const Turns of(pose);
-    for (int64_t f = 0; f < pose.size(); f++)
-        compose(pose[f], step[f], of.c[f], of.s[f], moved[f]);
+    for (int64_t f = 0; f < pose.size(); f++) compose(pose[f], step[f], of[f], moved[f]);
     return moved;
 }
 
@@ -96,14 +128,8 @@ inline Matrix<double> residual(Poses z, Poses x_i, Poses x_j) {
     check(z, x_i, x_j);
     auto e = new_array<double, 2>({z.shape[0], 3});
     Turns of_z(z), of_i(x_i);
-    for (int64_t f = 0; f < z.size(); f++) {
-        const double *i = x_i[f], *j = x_j[f], *m = z[f];
-        double c = of_z.c[f], s = of_z.s[f];
-        Seen t(i, j, of_i.c[f], of_i.s[f]);
-        e(f, 0) = c * (t.x - m[0]) + s * (t.y - m[1]);
-        e(f, 1) = c * (t.y - m[1]) - s * (t.x - m[0]);
-        e(f, 2) = wrapped(j[2] - i[2] - m[2]);
-    }
+    for (int64_t f = 0; f < z.size(); f++)
+        write_residual(z[f], x_i[f], x_j[f], of_z[f], of_i[f], e[f]);
     return e;
 }
 
@@ -111,19 +137,8 @@ inline Array<double, 4> jacobians(Poses z, Poses x_i, Poses x_j) {
     check(z, x_i, x_j);
     auto J = new_array<double, 4>({z.shape[0], 2, 3, 3});
     Turns of_z(z), of_i(x_i), of_j(x_j);
-    for (int64_t f = 0; f < z.size(); f++) {
-        double c = of_z.c[f], s = of_z.s[f], c_i = of_i.c[f], s_i = of_i.s[f];
-        Seen t(x_i[f], x_j[f], c_i, s_i);
-        double c_ij = c_i * of_j.c[f] + s_i * of_j.s[f], s_ij = c_i * of_j.s[f] - s_i * of_j.c[f];
-        double c_phi = c * c_ij + s * s_ij, s_phi = c * s_ij - s * c_ij;
-        double* to = J[f];
-        to[0] = -c, to[1] = -s, to[2] = c * t.y - s * t.x;
-        to[3] = s, to[4] = -c, to[5] = -s * t.y - c * t.x;
-        to[6] = 0, to[7] = 0, to[8] = -1;
-        to[9] = c_phi, to[10] = -s_phi, to[11] = 0;
-        to[12] = s_phi, to[13] = c_phi, to[14] = 0;
-        to[15] = 0, to[16] = 0, to[17] = 1;
-    }
+    for (int64_t f = 0; f < z.size(); f++)
+        write_jacobians(x_i[f], x_j[f], of_z[f], of_i[f], of_j[f], J[f]);
     return J;
 }
 
@@ -134,7 +149,7 @@ inline Array<double, 4> curvature(Poses z, Poses x_i, Poses x_j, Poses dual) {
     Turns of_z(z), of_i(x_i), of_j(x_j);
     for (int64_t f = 0; f < z.size(); f++) {
         double c = of_z.c[f], s = of_z.s[f], c_i = of_i.c[f], s_i = of_i.s[f];
-        Seen t(x_i[f], x_j[f], c_i, s_i);
+        Seen t(x_i[f], x_j[f], of_i[f]);
         double mx = c * dual(f, 0) - s * dual(f, 1), my = s * dual(f, 0) + c * dual(f, 1);
         c = c_i * of_j.c[f] + s_i * of_j.s[f], s = c_i * of_j.s[f] - s_i * of_j.c[f];
         double* to = H[f];

@@ -61,18 +61,18 @@ inline void compose(const double* a, const double* b, double* to) {
     compose(a, {b[0], b[1], b[2]}, turn_of(b), to);
 }
 
-// Poses moved by right steps: (rho, exp omega).
+// A pose moved by a right step: (rho, exp omega).
+inline void move(const double* pose, const double* step, double* to) {
+    const double half = std::sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5]) / 2;
+    const double scale = half == 0 ? 0.5 : std::sin(half) / (2 * half);
+    compose(pose, {step[0], step[1], step[2]},
+            {scale * step[3], scale * step[4], scale * step[5], std::cos(half)}, to);
+}
 inline Matrix<double> retract(Poses pose, Matrix<const double> step) {
     require(pose.shape[1] == 7, "pose must be (n, 7)");
     require(step.size() == pose.size() && step.shape[1] == 6, "step must be (n, 6), n as of pose");
     auto moved = new_array<double, 2>({pose.size(), 7});
-    for (int64_t f = 0; f < pose.size(); f++) {
-        const double* d = step[f];
-        const double half = std::sqrt(d[3] * d[3] + d[4] * d[4] + d[5] * d[5]) / 2;
-        const double scale = half == 0 ? 0.5 : std::sin(half) / (2 * half);
-        compose(pose[f], {d[0], d[1], d[2]},
-                {scale * d[3], scale * d[4], scale * d[5], std::cos(half)}, moved[f]);
-    }
+    for (int64_t f = 0; f < pose.size(); f++) move(pose[f], step[f], moved[f]);
     return moved;
 }
 
@@ -100,42 +100,44 @@ struct Seen {
     }
 };
 
+inline void write_residual(const double* z, const double* i, const double* j, double* e) {
+    Seen at(z, i, j);
+    Point t = turned_back(turn_of(z), {at.p.x - z[0], at.p.y - z[1], at.p.z - z[2]});
+    const double row[6] = {t.x, t.y, t.z, 2 * at.q.x, 2 * at.q.y, 2 * at.q.z};
+    std::copy(row, row + 6, e);
+}
 inline Matrix<double> residual(Poses z, Poses x_i, Poses x_j) {
     check(z, x_i, x_j);
     auto e = new_array<double, 2>({z.shape[0], 6});
-    for (int64_t f = 0; f < z.size(); f++) {
-        const double* m = z[f];
-        Seen at(m, x_i[f], x_j[f]);
-        Point t = turned_back(turn_of(m), {at.p.x - m[0], at.p.y - m[1], at.p.z - m[2]});
-        const double row[6] = {t.x, t.y, t.z, 2 * at.q.x, 2 * at.q.y, 2 * at.q.z};
-        std::copy(row, row + 6, e[f]);
-    }
+    for (int64_t f = 0; f < z.size(); f++) write_residual(z[f], x_i[f], x_j[f], e[f]);
     return e;
 }
 
+// J : (2, 6, 6) J_r_i and J_r_j.
+inline void write_jacobians(const double* z, const double* i, const double* j, double* J) {
+    Seen at(z, i, j);
+    Square R_z = Square::of(turn_of(z)), R_ij = Square::of(at.q_ij);
+    Square M = Square::skew({at.q.x, at.q.y, at.q.z}, at.q.w);
+    double *of_i = J, *of_j = J + 36;
+    std::fill_n(J, 72, 0.0);
+    const double p[3] = {at.p.x, at.p.y, at.p.z};
+    for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 3; c++) {
+            int a = (c + 1) % 3, b = (c + 2) % 3;
+            of_i[r * 6 + c] = -R_z.m[c][r];
+            // Row r of Rz' times [p]x is p x (column r of Rz), sign turned.
+            of_i[r * 6 + 3 + c] = R_z.m[a][r] * p[b] - R_z.m[b][r] * p[a];
+            of_j[(3 + r) * 6 + 3 + c] = M.m[r][c];
+            for (int k = 0; k < 3; k++) {
+                of_j[r * 6 + c] += R_z.m[k][r] * R_ij.m[k][c];
+                of_i[(3 + r) * 6 + 3 + c] -= M.m[r][k] * R_ij.m[c][k];
+            }
+        }
+}
 inline Array<double, 4> jacobians(Poses z, Poses x_i, Poses x_j) {
     check(z, x_i, x_j);
     auto J = new_array<double, 4>({z.shape[0], 2, 6, 6});
-    for (int64_t f = 0; f < z.size(); f++) {
-        Seen at(z[f], x_i[f], x_j[f]);
-        Square R_z = Square::of(turn_of(z[f])), R_ij = Square::of(at.q_ij);
-        Square M = Square::skew({at.q.x, at.q.y, at.q.z}, at.q.w);
-        double *of_i = J[f], *of_j = of_i + 36;
-        std::fill_n(of_i, 72, 0.0);
-        const double p[3] = {at.p.x, at.p.y, at.p.z};
-        for (int r = 0; r < 3; r++)
-            for (int c = 0; c < 3; c++) {
-                int a = (c + 1) % 3, b = (c + 2) % 3;
-                of_i[r * 6 + c] = -R_z.m[c][r];
-                // Row r of Rz' times [p]x is p x (column r of Rz), sign turned.
-                of_i[r * 6 + 3 + c] = R_z.m[a][r] * p[b] - R_z.m[b][r] * p[a];
-                of_j[(3 + r) * 6 + 3 + c] = M.m[r][c];
-                for (int k = 0; k < 3; k++) {
-                    of_j[r * 6 + c] += R_z.m[k][r] * R_ij.m[k][c];
-                    of_i[(3 + r) * 6 + 3 + c] -= M.m[r][k] * R_ij.m[c][k];
-                }
-            }
-    }
+    for (int64_t f = 0; f < z.size(); f++) write_jacobians(z[f], x_i[f], x_j[f], J[f]);
     return J;
 }
 
