@@ -43,7 +43,7 @@ class BetweenFactors:
     i, j : (m,) keyframe indices, i may be `WORLD`: an absolute factor; measurement : (m, p)
     relative poses; sqrt_information : (m, d, d) upper triangular roots, see `noise`, a zero row
     says nothing; trusted, struck : (m,) bool, a person or a marker vouches for it, or a person has
-    struck it out; predecessor : (n,) of the keyframes, see `FactorGraph`; told : some may be
+    struck it out; predecessor : (n,) of the keyframes, see `FactorGraph`; has_marks : some may be
     trusted or struck.
     """
 
@@ -54,7 +54,7 @@ class BetweenFactors:
     trusted: Mask
     struck: Mask
     predecessor: Indices
-    told: bool = True
+    has_marks: bool = True
 
     def __len__(self) -> int:
         return len(self.i)
@@ -122,7 +122,7 @@ class FactorGraph:
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
                          GrowingArray((), np.bool_)]
         self._factors: BetweenFactors | None = None
-        self._told = False  # of some factor: trusted, or struck
+        self._has_marks = False  # of some factor: trusted, or struck
         if n_poses:
             self.add_poses(n_poses)
 
@@ -169,7 +169,7 @@ class FactorGraph:
         clone = self.without_factors()
         clone._between = [column.copy() for column in self._between]
         clone._factors = self._factors
-        clone._told = self._told
+        clone._has_marks = self._has_marks
         return clone
 
     def without_factors(self) -> 'FactorGraph':
@@ -213,7 +213,7 @@ class FactorGraph:
             i, j, measurement, root, trusted, struck = (
                 column.view() for column in self._between)
             self._factors = BetweenFactors(
-                i, j, measurement, root, trusted, struck, self.predecessor, self._told)
+                i, j, measurement, root, trusted, struck, self.predecessor, self._has_marks)
         return self._factors
 
     def add_poses(self, count: int = 1, robot: int = 0, begins_part: bool = False) -> None:
@@ -295,7 +295,7 @@ class FactorGraph:
         """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
         none = np.zeros(len(i), bool)
         trusted, struck = none | trusted, none | struck
-        self._told = self._told or bool(trusted.any() or struck.any())
+        self._has_marks = self._has_marks or bool(trusted.any() or struck.any())
         values = i, j, measurement, sqrt_information, trusted, struck
         for column, value in zip(self._between, values, strict=True):
             column.extend(value)
@@ -303,7 +303,7 @@ class FactorGraph:
 
     def say(self, rows: Indices, trusted: bool) -> None:
         """Let some between factors be vouched for, or else struck out; the last word counts."""
-        self._told = True
+        self._has_marks = True
         for column, value in ((-2, trusted), (-1, not trusted)):
             said = self._between[column].view().copy()
             said[rows] = value

@@ -114,7 +114,7 @@ class FactorTable:
 
     def told(self, factors: BetweenFactors) -> 'FactorTable':
         """Return the table with a person's decisions applied; itself if nothing changes."""
-        if not factors.told or not (factors.trusted.any() or factors.struck.any()):
+        if not factors.has_marks or not (factors.trusted.any() or factors.struck.any()):
             return self
         before = self.accepted
         after = _by_person(before, factors)

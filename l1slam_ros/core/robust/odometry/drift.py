@@ -84,18 +84,19 @@ class Straight:
     """
     The states that odometry without a drift leads to.
 
-    drift : [rad/m]; found, told : with the estimated noise, and with the larger of this and the
-    stated one.
+    drift : [rad/m]; found, as_stated : with the estimated noise, and with the larger of this and
+    the stated one.
     """
 
     drift: float
     found: Growth
-    told: Growth
+    as_stated: Growth
 
     @cached_property
     def log_room(self) -> float:
         """The ln of the volume of the claims of an outlier on this map."""
-        return float(claimed_volume(self.told.given.graph.manifold, self.told.poses).sum())
+        growth = self.as_stated
+        return float(claimed_volume(growth.given.graph.manifold, growth.poses).sum())
 
     @cached_property
     def log_evidence(self) -> float:
@@ -106,7 +107,7 @@ class Straight:
         normal prior about 0, and the map estimates it with information S: Laplace's approximation
         of the integral over it.
         """
-        growth = self.told
+        growth = self.as_stated
         alone = np.count_nonzero(np.bincount(growth.given.place[self.loops]) == 1)
         known = np.log1p(USUAL**2 * drift_information(growth)) if self.drift else 0.0
         return float(
@@ -116,20 +117,20 @@ class Straight:
     @cached_property
     def stretches(self) -> float:
         """The number of stretches along which loops are, less that of places."""
-        one, other = self.told.given.mates
-        loops = np.isin(np.arange(len(self.told.accepted)), self.loops)
+        one, other = self.as_stated.given.mates
+        loops = np.isin(np.arange(len(self.as_stated.accepted)), self.loops)
         near = np.bincount(one, loops[other], len(loops))[loops]
         return float((1 / (1 + near)).sum()) - len(self._one_each)
 
     @cached_property
     def _one_each(self) -> Indices:
-        place = self.told.given.place[self.loops]
+        place = self.as_stated.given.place[self.loops]
         return np.asarray(self.loops[np.unique(place, return_index=True)[1]])
 
     @cached_property
     def loops(self) -> Indices:
         """The loops that are accepted, (k,)."""
-        return np.asarray(np.flatnonzero(self.told.loops))
+        return np.asarray(np.flatnonzero(self.as_stated.loops))
 
 
 def hypotheses_of(some: list[Straight]) -> list[Hypothesis]:
@@ -143,7 +144,7 @@ def hypotheses_of(some: list[Straight]) -> list[Hypothesis]:
     widest = max(straight.log_room for straight in some)
     values = [straight.log_evidence + straight.stretches * (straight.log_room - widest)
               for straight in some]
-    least = values[0] + (margin_of(some[0].told) if len(some[0].loops) else 0.0)
+    least = values[0] + (margin_of(some[0].as_stated) if len(some[0].loops) else 0.0)
     return [Hypothesis(straight.found, value - least, straight.drift)
             for straight, value in zip(some[1:], values[1:], strict=True) if len(straight.loops)]
 
